@@ -1,0 +1,1 @@
+"""The page: widgets -> Settings -> pipeline -> Rollout -> views. viser lives only here."""

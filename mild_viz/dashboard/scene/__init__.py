@@ -1,0 +1,1 @@
+"""Dumb views: each draws fields of one Rollout by assigning handle properties."""

@@ -1,0 +1,1 @@
+"""Recordings: one reader per source, windows, download and the built-in demo set."""

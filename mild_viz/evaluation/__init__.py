@@ -1,0 +1,1 @@
+"""Evaluation: prediction error beside simple baselines and the published figures."""

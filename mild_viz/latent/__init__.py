@@ -1,0 +1,1 @@
+"""The latent model: VAE, hidden Markov model, EM and Gaussian mixture regression."""

@@ -1,0 +1,1 @@
+"""The robot: kinematic chain, retargeting, IK with a joint prior, contact and stiffness."""

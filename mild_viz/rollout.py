@@ -1,0 +1,135 @@
+"""Everything that a view may draw, as NumPy arrays: the result of one run of the pipeline."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mild_viz.trial import Skeleton, freeze_arrays
+
+SAVED = (
+    "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state",
+    "human_latent_mean", "human_latent_covariance", "robot_latent_mean", "robot_latent_covariance",
+    "robot_latent_truth", "joints_decoded", "joints_commanded", "joints_truth", "end_effector", "target",
+    "contact", "stiffness",
+)  # fmt: skip
+"""Names of the arrays in a rollout file; row n of all of them belongs to human window n."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What the model says about one trial: encode, filter, condition, decode.
+
+    Row n belongs to human window n, whose newest observation is frame n + 4; joints are those of frame
+    n + 5, the first of the predicted window. N windows, S states, D latent dimensions, J joints.
+    """
+
+    dataset: str
+    split: str
+    trial: int
+    action: str
+    variant: str
+    rate: float
+    joint_names: tuple[str, ...]
+    time: Float[np.ndarray, " N"]
+    """Time of the newest observation [s]."""
+    observed: Bool[np.ndarray, " N"]
+    """False where the window could not be filled (tracking lost): the filter then only predicts."""
+    log_alpha_human: Float[np.ndarray, "N S"]
+    log_alpha_joint: Float[np.ndarray, "N S"]
+    log_alpha_unobserved: Float[np.ndarray, "N S"]
+    active_state: Int[np.ndarray, " N"]
+    """argmax of the human-only forward variable."""
+    human_latent_mean: Float[np.ndarray, "N D"]
+    human_latent_covariance: Float[np.ndarray, "N D D"]
+    robot_latent_mean: Float[np.ndarray, "N D"]
+    """Predicted, Eq. conditioning-withcov-mu-t."""
+    robot_latent_covariance: Float[np.ndarray, "N D D"]
+    """Predicted, Eq. conditioning-withcov-sigma-t."""
+    robot_latent_truth: Float[np.ndarray, "N D"]
+    """Encoded true partner window; NaN where the truth is unknown."""
+    joints_decoded: Float[np.ndarray, "N J"]
+    joints_truth: Float[np.ndarray, "N J"]
+    """NaN where the truth is unknown."""
+    window_error: Float[np.ndarray, " N"]
+    """Mean squared error of the predicted window [rad^2]."""
+    human_state_means: Float[np.ndarray, "S D"]
+    human_state_covariances: Float[np.ndarray, "S D D"]
+    robot_state_means: Float[np.ndarray, "S D"]
+    robot_state_covariances: Float[np.ndarray, "S D D"]
+    human_arm: Float[np.ndarray, "N 3 3"]
+    """Shoulder, elbow, wrist at the newest observation, human frame [m]; gaps are NaN."""
+    human_hand: Float[np.ndarray, "N 3"]
+    """The wrist as the controller sees it: gaps filled by the last observation."""
+    human_skeleton: Skeleton | None = None
+    """The whole body at the newest observations, human frame, where it was recorded."""
+    phase: Int[np.ndarray, " N"] | None = None
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def n_windows(self) -> int:
+        return len(self.time)
+
+    @property
+    def n_states(self) -> int:
+        return self.log_alpha_human.shape[1]
+
+    def log_alpha(self, mode: str) -> Float[np.ndarray, "N S"]:
+        """The forward variable in one of `ALPHA_MODES`."""
+        return getattr(self, f"log_alpha_{mode}")
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """An `Inference` and the commands that a controller makes of it. World is the robot's base frame."""
+
+    inference: Inference
+    controller: str
+    robot: str
+    joints_commanded: Float[np.ndarray, "N J"]
+    end_effector: Float[np.ndarray, "N 3"]
+    """Commanded end effector position, world [m]."""
+    end_effector_decoded: Float[np.ndarray, "N 3"]
+    target: Float[np.ndarray, "N 3"]
+    """The human's hand, world [m]."""
+    hand_distance: Float[np.ndarray, " N"]
+    """|end_effector - target| [m]."""
+    contact: Bool[np.ndarray, " N"]
+    stiffness: Float[np.ndarray, "N J"]
+    """Fraction of full joint stiffness, 0 to 1."""
+    T_world_human: Float[np.ndarray, "4 4"]
+    link_names: tuple[str, ...]
+    link_poses: Float[np.ndarray, "N L 7"]
+    """Commanded pose of every drawn link in world: wxyz, xyz."""
+    link_poses_decoded: Float[np.ndarray, "N L 7"]
+    """The same for the decoded joints, before IK (the ghost)."""
+    state_durations: Float[np.ndarray, " S"]
+    """Mean length of a visit to each state [s], by `active_state`; 0 where never visited."""
+    state_occupancy: Float[np.ndarray, " S"]
+    """Share of the trial in which each state is active."""
+    contact_states: frozenset[int]
+    placement_source: str
+    """Where the placement of the human comes from, in words for the page."""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def array(self, name: str) -> np.ndarray:
+        """One of the arrays named in `SAVED`."""
+        return getattr(self if name in type(self).__dataclass_fields__ else self.inference, name)
+
+    def save(self, path: Path) -> None:
+        """Write the arrays named in `SAVED` to an .npz file, atomically."""
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "wb") as file:
+                np.savez_compressed(file, **{name: self.array(name) for name in SAVED})  # pyright: ignore[reportArgumentType]
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)

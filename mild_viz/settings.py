@@ -1,0 +1,110 @@
+"""What a person can choose: the variant table and the frozen settings of a rerun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mild_viz.errors import UserError
+
+WINDOW = 5
+"""Observations in one window (Sec. V-B of the paper)."""
+
+STATE_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C8C8C")
+"""Colour of each HMM state, after Okabe and Ito (safe for colour-blind readers)."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the paper's Table 'Differences in conditioning and sampling strategies'."""
+
+    name: str
+    conditional_training: str
+    """What the robot decoder is trained on besides posterior samples: 'none', 'posterior-samples'
+    (conditioned means of samples of the human posterior) or 'conditional-samples' (samples of Eq. pz2z1)."""
+    posterior_covariance: bool
+    """Whether the human posterior's covariance enters the gain (Eq. conditioning-withcov-K-i)."""
+    summary: str
+
+
+VARIANTS: dict[str, Variant] = {
+    variant.name: variant
+    for variant in (
+        Variant("v1", "none", False, "HMM prior only, no conditional training"),
+        Variant("v2.1", "posterior-samples", False, "decodes conditioned posterior samples"),
+        Variant("v2.2", "posterior-samples", True, "as v2.1, with the posterior covariance"),
+        Variant("v3.1", "conditional-samples", False, "decodes samples of the conditional"),
+        Variant("v3.2", "conditional-samples", True, "as v3.1, with the posterior covariance"),
+    )
+}
+
+ALPHA_MODES = ("human", "joint", "unobserved")
+CONTROLLERS = ("base-ik", "mild", "mild-ik")
+
+
+def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:
+    """Return `value` if it is valid, else raise an error that lists what would be."""
+    if value not in valid:
+        raise UserError(f"{kind} '{value}' is unknown; valid: {', '.join(valid)}")
+    return value
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the human stands seen from the robot: the human frame's origin in the robot's base frame [m].
+
+    The human faces the robot (yaw of pi about z). `source` says in words where the numbers come from.
+    """
+
+    distance: float
+    lateral: float
+    height: float
+    source: str = "chosen"
+    estimated: bool = False
+
+
+@dataclass(frozen=True)
+class InferSettings:
+    """What decides the inference: model, variant and trial. A change here reruns everything."""
+
+    dataset: str = "demo"
+    split: str = "test"
+    trial: int = 0
+    variant: str = "v3.1"
+
+    def __post_init__(self) -> None:
+        choose("variant", self.variant, list(VARIANTS))
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """What decides the command that is sent to the robot. A change here reruns only `control`."""
+
+    controller: str = "mild-ik"
+    lambda_x: float = 1.0
+    """Weight of reaching the target (Eq. ik-prior-simplified)."""
+    lambda_q: float = 0.01
+    """Weight of staying at the decoded joints (Eq. ik-prior-simplified)."""
+    contact_states: frozenset[int] = frozenset()
+    """HMM states in which the partners touch, for the trial's action."""
+    stiffness: bool = True
+    """Lower the stiffness in contact (handshake)."""
+    smoothing: float = 0.8
+    """Weight of the new command in the moving average; 1 switches it off."""
+    placement: Placement | None = None
+    """None: the checkpoint's own, or the recording's where it has one world frame."""
+
+    def __post_init__(self) -> None:
+        choose("controller", self.controller, CONTROLLERS)
+        for name in ("lambda_x", "lambda_q"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number of 0 or more")
+        if not 0.0 < self.smoothing <= 1.0:
+            raise UserError(f"smoothing is {self.smoothing}; valid: above 0, up to 1")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that the pipeline needs to know besides the model and the data."""
+
+    infer: InferSettings = field(default_factory=InferSettings)
+    control: ControlSettings = field(default_factory=ControlSettings)
