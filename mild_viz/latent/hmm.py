@@ -1,0 +1,122 @@
+"""The Gaussian hidden Markov model over joint human and robot latents: filter, smoother, Viterbi path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mild_viz.errors import UserError
+from mild_viz.latent import kernels
+from mild_viz.trial import freeze_arrays
+
+
+def safe_log(probabilities: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Logarithm that maps 0 to -inf without a warning."""
+    with np.errstate(divide="ignore"):
+        return np.log(probabilities)
+
+
+@dataclass(frozen=True, eq=False)
+class HMM:
+    """A hidden Markov model with full-covariance Gaussian emissions (Sec. III-B of the paper).
+
+    `transition_matrix[i, j]` is p(j given i). In a joint model the first `human_size` latent dimensions are
+    the human's, the others the robot's (Eq. gmr).
+    """
+
+    initial_probs: Float[np.ndarray, " S"]
+    transition_matrix: Float[np.ndarray, "S S"]
+    emission_means: Float[np.ndarray, "S D"]
+    emission_covariances: Float[np.ndarray, "S D D"]
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def n_states(self) -> int:
+        return len(self.initial_probs)
+
+    def marginal(self, dimensions: slice) -> HMM:
+        """The model of some of the latent dimensions alone."""
+        return HMM(
+            self.initial_probs,
+            self.transition_matrix,
+            self.emission_means[:, dimensions],
+            self.emission_covariances[:, dimensions, dimensions],
+        )
+
+
+def check_hmm(hmm: HMM, where: str) -> HMM:
+    """Return `hmm` if it is a valid model, else raise an error that says what is wrong."""
+    if not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6) or (hmm.transition_matrix < 0).any():
+        raise UserError(f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})")
+    if not np.isclose(hmm.initial_probs.sum(), 1.0, atol=1e-6) or (hmm.initial_probs < 0).any():
+        raise UserError(f"{where}: initial_probs are not probabilities (sum {hmm.initial_probs.sum()})")
+    lowest = np.linalg.eigvalsh(hmm.emission_covariances).min()
+    if not lowest > 0:
+        raise UserError(f"{where}: an emission covariance is not positive definite (lowest eigenvalue {lowest})")
+    return hmm
+
+
+def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N S"]:
+    """log N(z_n; mu_i, Sigma_i). A row of `z` with NaN is a missing observation and gives a row of zeros."""
+    factors = np.linalg.cholesky(hmm.emission_covariances)
+    # One triangular inverse a state, then one product for all steps: D is small and N is large.
+    inverse_factors = np.linalg.inv(factors)
+    offsets = np.einsum("sde,se->sd", inverse_factors, hmm.emission_means)
+    whitened = np.einsum("sde,ne->nsd", inverse_factors, z) - offsets
+    log_det = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+    size = z.shape[1]
+    log_density = -0.5 * (whitened**2).sum(2) - log_det - 0.5 * size * np.log(2 * np.pi)
+    return np.where(np.isnan(z).any(1)[:, None], 0.0, log_density)
+
+
+def forward_filter(
+    hmm: HMM,
+    log_likelihood: Float[np.ndarray, "N S"],
+    previous: Float[np.ndarray, " S"] | None = None,
+) -> tuple[Float[np.ndarray, "N S"], float]:
+    """Normalised forward variable log alpha (Eq. hmm-h), and log p(z_{1:N}).
+
+    `previous` is log alpha of the step before the first row: a stream continues from it. A row of zeros in
+    `log_likelihood` is a step without an observation; all rows zero give the unobserved forward variable
+    of Eq. vaeHMM-prior.
+    """
+    log_transition = safe_log(hmm.transition_matrix)
+    if previous is None:
+        log_prior = safe_log(hmm.initial_probs)
+    else:
+        log_prior = np.logaddexp.reduce(previous[:, None] + log_transition, axis=0)
+    log_alpha = np.empty(log_likelihood.shape)
+    total = kernels.forward(log_prior, log_transition, np.ascontiguousarray(log_likelihood), log_alpha)
+    return log_alpha, float(total)
+
+
+def unobserved_forward(hmm: HMM, n_steps: int) -> Float[np.ndarray, "N S"]:
+    """log of the unobserved forward variable (Eq. vaeHMM-prior) for the first `n_steps` steps."""
+    return forward_filter(hmm, np.zeros((n_steps, hmm.n_states)))[0]
+
+
+def smooth(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "N S"]:
+    """log p(state at n given z_{1:N}), by forward-backward."""
+    log_alpha, _ = forward_filter(hmm, log_likelihood)
+    log_beta = np.empty_like(log_alpha)
+    kernels.backward(safe_log(hmm.transition_matrix), np.ascontiguousarray(log_likelihood), log_beta)
+    log_gamma = log_alpha + log_beta
+    return log_gamma - np.logaddexp.reduce(log_gamma, axis=1, keepdims=True)
+
+
+def viterbi_path(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
+    """Most likely state sequence, and its joint log probability with the observations."""
+    path = np.empty(len(log_likelihood), dtype=np.int64)
+    score = kernels.viterbi(
+        safe_log(hmm.initial_probs), safe_log(hmm.transition_matrix), np.ascontiguousarray(log_likelihood), path
+    )
+    return path, float(score)
+
+
+def observed_rows(z: Float[np.ndarray, "N D"]) -> Bool[np.ndarray, " N"]:
+    """True where a step has an observation."""
+    return ~np.isnan(z).any(1)
