@@ -1,0 +1,36 @@
+"""What a person can choose about the picture. A change here never reruns the pipeline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mild_viz.errors import UserError
+from mild_viz.settings import ALPHA_MODES, choose
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """How one rollout is drawn."""
+
+    alpha_mode: str = "human"
+    """Which forward variable sets the opacity of the ellipsoids, one of `ALPHA_MODES`."""
+    latent_axes: tuple[int, int, int] | str = "pca"
+    """Latent dimensions on the three axes, or 'pca': the principal components of all trajectories."""
+    sigma: float = 1.0
+    """Radius of the ellipsoids in standard deviations."""
+    ghost: bool = True
+    """Draw the decoded motion, before inverse kinematics, as a translucent arm."""
+    show_human: bool = True
+    show_robot: bool = True
+    show_latent: bool = True
+    dark: bool = False
+
+    def __post_init__(self) -> None:
+        choose("alpha mode", self.alpha_mode, ALPHA_MODES)
+        if not 0.0 < self.sigma < float("inf"):
+            raise UserError(f"sigma is {self.sigma}; valid: a finite number above 0")
+        axes = self.latent_axes
+        if axes == "pca":
+            return
+        if isinstance(axes, str) or len(axes) != 3 or len(set(axes)) != 3 or min(axes) < 0:
+            raise UserError(f"latent axes are {axes!r}; valid: 'pca' or three different dimensions")
