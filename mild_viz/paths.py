@@ -6,6 +6,9 @@ from pathlib import Path
 
 from mild_viz.errors import UserError
 
+SHIPPED_MODELS = {"demo": "demo", "nuisi": "nuisi-pepper"}
+"""Folder under `checkpoints/` that holds the model for a dataset."""
+
 PACKAGE = Path(__file__).resolve().parent
 
 
@@ -17,6 +20,16 @@ def assets() -> Path:
 def checkpoints() -> Path:
     """The folder that holds the shipped models. Raises UserError where the installation lacks it."""
     return _shipped("checkpoints")
+
+
+def default_checkpoint(dataset: str) -> Path:
+    """The shipped model for a dataset. Raises UserError where none ships for it."""
+    if dataset not in SHIPPED_MODELS:
+        raise UserError(
+            f"no model ships for dataset '{dataset}'; give one with --checkpoint, trained by: "
+            f"mild-viz train --dataset {dataset} (models ship for {', '.join(SHIPPED_MODELS)})"
+        )
+    return checkpoints() / SHIPPED_MODELS[dataset]
 
 
 def _shipped(folder: str) -> Path:

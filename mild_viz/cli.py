@@ -1,0 +1,294 @@
+"""The console command `mild-viz`: options and their help; each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from mild_viz import paths
+from mild_viz.errors import UserError
+from mild_viz.run_options import OptionalInt, OptionalPath, OptionalText, RunOptions, VariantName, documented
+
+
+def app(
+    checkpoint: OptionalPath = None,
+    dataset: str = "demo",
+    action: OptionalText = None,
+    trial: int = 0,
+    variant: VariantName = "v3.1",
+    robot: str = "pepper",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> None:
+    """Start the dashboard; stop it with Ctrl-C.
+
+    Without options it shows the built-in demo set with the demo model at http://127.0.0.1:8080.
+    Example: mild-viz app --dataset nuisi --action handshake --variant v3.2
+
+    Args:
+        checkpoint: Folder of a trained model. Default: the shipped model of the dataset, that is checkpoints/demo
+            for demo, checkpoints/nuisi-pepper for nuisi. Example: --checkpoint checkpoints/nuisi-pepper
+        dataset: Recordings to open: demo (built in), nuisi, yumi, handover (see: mild-viz data list).
+            Example: --dataset nuisi
+        action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the first one
+            that dataset and model share. Example: --action handshake
+        trial: Trial to show first: its number among the test trials of the action, from 0. Example: --trial 1
+        variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
+            has the table). Example: --variant v2.1
+        robot: Robot to control: pepper, or the path of a URDF file with the joints that the model drives; meshes
+            named package://... are looked up beside the file. Example: --robot ~/pepper.urdf
+        host: Network address to listen on. There is no password: leave it at this machine's own address unless
+            everybody on the network may use the page. Example: --host 0.0.0.0
+        port: TCP port to listen on. Example: --port 9000
+        open_browser: Also open the page in this machine's browser.
+    """
+    from mild_viz.dashboard.app import run
+
+    run(
+        checkpoint=checkpoint or paths.default_checkpoint(dataset),
+        dataset=dataset,
+        action=action,
+        trial=trial,
+        variant=variant,
+        robot=robot,
+        host=host,
+        port=port,
+        open_browser=open_browser,
+    )
+
+
+def data_list() -> None:
+    """List the datasets, what each holds, whether it is here, and where it was looked for.
+
+    Recordings are looked for in the folder named by the environment variable MILD_VIZ_DATA, else in the
+    user's cache.
+    """
+    from mild_viz.data.commands import list_datasets
+
+    _leave(list_datasets())
+
+
+def data_fetch(name: tyro.conf.Positional[str]) -> None:
+    """Download the recordings of a dataset from their public source, and check their SHA-256.
+
+    They are put into the folder named by MILD_VIZ_DATA, else into the user's cache; what is there and intact
+    is not loaded again. Example: mild-viz data fetch nuisi
+
+    Args:
+        name: Dataset to download, as named by: mild-viz data list
+    """
+    from mild_viz.data.commands import fetch
+
+    _leave(fetch(name))
+
+
+def data_check(path: tyro.conf.Positional[Path]) -> None:
+    """Read a file or folder of recordings and report what it holds and what is wrong with it.
+
+    Example: mild-viz data check ~/recordings/nuisi/traj_data.npz
+
+    Args:
+        path: File or folder to check.
+    """
+    from mild_viz.data.commands import check
+
+    _leave(check(path))
+
+
+def train(
+    out: Path,
+    dataset: str = "demo",
+    stage: Literal["hhi", "hri"] = "hri",
+    variant: tuple[VariantName, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
+    seeds: int = 4,
+    epochs: OptionalInt = None,
+    resume: bool = False,
+) -> None:
+    """Train a model: Algorithms 1 and 2 of the paper.
+
+    Stage hhi trains the shared human VAE and one HMM for every interaction on human-human trials; stage hri does
+    that, and then trains the robot's VAEs on the frozen human side, all variants and seeds together. The best seed
+    is chosen on training trials that are held out, never on the test set.
+    Example: mild-viz train --dataset nuisi --out runs/nuisi --variant v3.1 v3.2 --seeds 8
+
+    Args:
+        out: Folder to write the model to; it holds the state of an unfinished run, too. Example: --out runs/mine
+        dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
+        variant: Variants to train, one or several. Example: --variant v3.1 v3.2
+        seeds: Number of runs from different random starts (seeds 0, 1, ...) to choose from. Example: --seeds 8
+        epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
+        resume: Go on from the state in --out, where an earlier run was interrupted.
+    """
+    from mild_viz.training.run import train as run
+
+    run(dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume)
+
+
+def evaluate(
+    checkpoint: OptionalPath = None,
+    dataset: str = "demo",
+    json: OptionalPath = None,
+) -> None:
+    """Measure a model on the test trials, beside simple baselines and the paper's figures.
+
+    For every variant and action: mean squared error of the predicted robot windows [rad^2], its standard deviation
+    over windows, the number of windows and trials; beside them a constant mean, a time-indexed mean, ridge regression
+    and nearest neighbours fitted on the training trials. Example: mild-viz evaluate --dataset nuisi --json nuisi.json
+
+    Args:
+        checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
+        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        json: File for the table, as a list of rows. Default: print only. Example: --json results.json
+    """
+    from mild_viz.evaluation.report import evaluate as run
+
+    if json is not None:
+        _check_output(json, ".json")
+    run(checkpoint or paths.default_checkpoint(dataset), dataset, json)
+
+
+def rollout(run: RunOptions, out: Path) -> None:
+    """Run the pipeline on one trial and write the arrays to an .npz file.
+
+    Row n of every array belongs to human window n, whose newest observation is frame n + 4; joints are those of
+    frame n + 5. Units are metres, radians and seconds. The README lists the arrays.
+    Example: mild-viz rollout --dataset nuisi --trial 3 --variant v3.1 --controller mild-ik --out rollout.npz
+
+    Args:
+        run: What to run.
+        out: File to write. Example: --out rollout.npz
+    """
+    _check_output(out, ".npz")
+    result = run.run()
+    result.save(out)
+    inference = result.inference
+    print(
+        f"{out}: {inference.dataset}/{inference.split}/{inference.trial} ({inference.action}), {inference.variant}, "
+        f"{result.controller}: {inference.n_windows} windows, {inference.n_states} states"
+    )
+
+
+def record(run: RunOptions, out: Path, csv: OptionalPath = None) -> None:
+    """Record one trial as a web page that plays offline, and as a table.
+
+    Example: mild-viz record --dataset demo --trial 0 --out handshake.html --csv handshake.csv
+
+    Args:
+        run: What to run.
+        out: The page: one self-contained file that a browser opens without a network. Example: --out wave.html
+        csv: The table: one row a frame with time, active state, forward variable, joints, stiffness and distance.
+            Example: --csv wave.csv
+    """
+    from mild_viz.dashboard.recorder import record_csv, record_html
+    from mild_viz.dashboard.view import ViewSettings
+    from mild_viz.robot.model import load_robot
+
+    _check_output(out, ".html")
+    if csv is not None:
+        _check_output(csv, ".csv")
+    result = run.run()
+    record_html(result, load_robot(run.robot, result.inference.joint_names), ViewSettings(), out)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {result.inference.n_windows} frames")
+    if csv is not None:
+        record_csv(result, csv)
+        print(f"{csv}: {result.inference.n_windows} rows")
+
+
+def import_published(file: tyro.conf.Positional[Path], out: Path) -> None:
+    """Convert a Pepper model published by the paper's authors (.pth) to a checkpoint of this program.
+
+    The file is a pickle, which could name any code; it is read with an unpickler that admits only what such a model
+    holds, and runs nothing of it. Example: mild-viz import-published mild_v3_2_pepper_nuisi.pth --out runs/published
+
+    Args:
+        file: The published file.
+        out: Folder to write the checkpoint to. Example: --out runs/published
+    """
+    from mild_viz.published import import_published as convert
+
+    checkpoint = convert(file, out)
+    print(f"{out}: by its own arguments, {file.name} is {', '.join(checkpoint.variants)}")
+
+
+def _leave(status: int | None) -> None:
+    if status:
+        raise SystemExit(status)
+
+
+def _check_output(path: Path, suffix: str) -> None:
+    """Refuse a file that cannot be written before the work is done, not after."""
+    if path.suffix.lower() != suffix:
+        raise UserError(f"{path}: the name must end in {suffix}")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        raise UserError(f"{path} cannot be written: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"{path} cannot be written: the folder {path.parent} is read-only")
+
+
+def _choice(commands: dict[str, Any]) -> Any:
+    """A type of which tyro makes one subcommand for each entry; an entry may be a group of its own."""
+    parts = [
+        Annotated[Any, tyro.conf.subcommand(name=name, constructor=documented(run))] for name, run in commands.items()
+    ]
+    return reduce(or_, parts)
+
+
+DATA_COMMANDS = {"list": data_list, "fetch": data_fetch, "check": data_check}
+
+
+def data(command: _choice(DATA_COMMANDS)) -> None:  # pyright: ignore[reportInvalidTypeForm]
+    """List, download and check recordings."""
+
+
+COMMANDS = {
+    "app": app,
+    "data": data,
+    "train": train,
+    "evaluate": evaluate,
+    "rollout": rollout,
+    "record": record,
+    "import-published": import_published,
+}
+
+
+def _run(commands: Any, program: str, arguments: Sequence[str] | None, description: str | None = None) -> int:
+    """Parse and run; a message for a person, and 2, where something that was given is unusable."""
+    try:
+        tyro.cli(
+            commands,
+            prog=program,
+            args=arguments,
+            description=description,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+        )
+    except UserError as error:
+        print(f"{program}: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`mild-viz`: returns the exit code; parse errors and --help leave by SystemExit (2 and 0)."""
+    description = (
+        "Latent interaction dynamics and robot playback: data, training, evaluation, rollouts, recordings, and a "
+        "dashboard in the browser. Start with: mild-viz app"
+    )
+    return _run(_choice(COMMANDS), "mild-viz", arguments, description)
+
+
+def main_app(arguments: Sequence[str] | None = None) -> int:
+    """`python app.py`: the options of `mild-viz app`."""
+    return _run(app, "app.py", arguments)

@@ -1,0 +1,112 @@
+"""What the commands `rollout` and `record` run the pipeline on, and how the options of any command are documented."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+
+import tyro
+
+from mild_viz import paths
+from mild_viz.errors import UserError
+
+if TYPE_CHECKING:
+    from mild_viz.rollout import Rollout
+
+# Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
+VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2"]
+ControllerName = Literal["base-ik", "mild", "mild-ik"]
+SplitName = Literal["train", "test"]
+
+# Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]
+OptionalPosition = Annotated[
+    tuple[float, float, float] | None, tyro.conf.arg(metavar="FLOAT FLOAT FLOAT", help_behavior_hint="")
+]
+
+T = TypeVar("T")
+
+
+def documented(command: T) -> T:
+    """Join the broken lines of each option's description: tyro would print the breaks of the source."""
+    command.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(command.__doc__ or ""))
+    return command
+
+
+@documented
+@dataclass(frozen=True)
+class RunOptions:
+    """What to run the pipeline on: model, trial and controller.
+
+    Attributes:
+        checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
+        dataset: Recordings: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        split: Part of the dataset. Example: --split train
+        trial: Trial of the split, from 0. Example: --trial 3
+        variant: Variant of MILD. Example: --variant v2.1
+        controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
+            kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
+            model). Example: --controller mild
+        contact_states: States of the HMM in which the partners touch. Default: the model's own, as saved from
+            the dashboard. Example: --contact-states 2 3
+        lambda_x: Weight of reaching the hand [1/m^2], 0 or more. Example: --lambda-x 2
+        lambda_q: Weight of staying at the decoded joints [1/rad^2], 0 or more. Example: --lambda-q 0.1
+        smoothing: Weight of the new command in the moving average, above 0 and up to 1 (1: no smoothing).
+            Example: --smoothing 1
+        stiffness: Lower the joints' stiffness in the contact states of a handshake.
+        placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
+            recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
+            0.8
+        robot: Robot to control: pepper, or the path of a URDF file. Example: --robot ~/pepper.urdf
+    """
+
+    checkpoint: OptionalPath = None
+    dataset: str = "demo"
+    split: SplitName = "test"
+    trial: int = 0
+    variant: VariantName = "v3.1"
+    controller: ControllerName = "mild-ik"
+    contact_states: OptionalStates = None
+    lambda_x: float = 1.0
+    lambda_q: float = 0.01
+    smoothing: float = 0.8
+    stiffness: bool = True
+    placement: OptionalPosition = None
+    robot: str = "pepper"
+
+    def run(self) -> Rollout:
+        """Load model, trial and robot, and run the pipeline. Raises UserError."""
+        from mild_viz.checkpoint import load_checkpoint
+        from mild_viz.data.load import load_dataset
+        from mild_viz.pipeline import control, infer
+        from mild_viz.robot.model import load_robot
+        from mild_viz.settings import ControlSettings, Placement
+
+        checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
+        trial = load_dataset(self.dataset).trial(self.split, self.trial)
+        interface = checkpoint.for_robot()
+        inference = infer(checkpoint, trial, self.variant)
+        if self.contact_states is None:
+            contact_states = checkpoint.contact_states.get(trial.action, frozenset())
+        else:
+            contact_states = frozenset(self.contact_states)
+            wrong = sorted(state for state in contact_states if not 0 <= state < inference.n_states)
+            if wrong:
+                raise UserError(f"--contact-states: {wrong} do not exist; valid: 0 to {inference.n_states - 1}")
+        settings = ControlSettings(
+            controller=self.controller,
+            lambda_x=self.lambda_x,
+            lambda_q=self.lambda_q,
+            contact_states=contact_states,
+            stiffness=self.stiffness,
+            smoothing=self.smoothing,
+            placement=None if self.placement is None else Placement(*self.placement),
+        )
+        robot = load_robot(self.robot, interface.joint_names, interface.end_effector)
+        return control(inference, checkpoint, robot, trial, settings)
