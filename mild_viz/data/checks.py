@@ -13,6 +13,9 @@ from jaxtyping import Float
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
 
+TRAJECTORY_ARRAYS = ("train_data", "train_labels", "test_data", "test_labels")
+"""What a `traj_data.npz` of the authors holds."""
+
 
 def file_checksum(*paths: Path) -> str:
     """SHA-256 of the contents of the files, one after the other."""

@@ -6,18 +6,12 @@ import os
 from functools import cache
 from pathlib import Path
 
+from mild_viz.data.sources import SOURCES
 from mild_viz.errors import UserError
 from mild_viz.trial import Dataset
 
-DATASETS = ("demo", "nuisi", "yumi", "handover")
-
-FILES: dict[str, tuple[Path, ...]] = {
-    "demo": (),
-    "nuisi": (Path("nuisi/traj_data.npz"),),
-    "yumi": (Path("buetepage_hr/traj_data.npz"),),
-    "handover": (Path("handover/train.npz"), Path("handover/test.npz")),
-}
-"""The files, below the data folder, without which a dataset cannot be read."""
+DATASETS = tuple(SOURCES)
+"""demo, nuisi, yumi, handover."""
 
 
 def data_root() -> Path:
@@ -37,8 +31,9 @@ def check_name(name: str) -> None:
 
 
 def missing_files(name: str, root: Path) -> list[Path]:
-    """Those of a dataset's files that are not below `root`."""
-    return [file for file in FILES[name] if not (root / file).is_file()]
+    """Those of the files that a dataset needs which are not below `root`."""
+    needed = [file.path for file in SOURCES[name].files if not file.optional]
+    return [path for path in needed if not (root / path).is_file()]
 
 
 def load_dataset(name: str, root: Path | None = None) -> Dataset:

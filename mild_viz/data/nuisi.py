@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mild_viz.data import nuitrack
-from mild_viz.data.checks import check_trial_array, file_checksum, paired
+from mild_viz.data.checks import TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
 from mild_viz.data.npz import load_npz
 from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices
 from mild_viz.errors import UserError
@@ -30,8 +30,7 @@ def read_nuisi(root: Path) -> Dataset:
     The checksum is that of the .npz file: the raw recordings add bodies to draw, never other arms.
     """
     path = Path(root) / FILE
-    arrays = load_npz(path, ("train_data", "train_labels", "test_data", "test_labels"))
-    train, test = (_read_split(path, split, arrays) for split in ("train", "test"))
+    train, test = read_file(path)
     for file, field in zip(RAW_FILES, ("human", "partner"), strict=True):
         if (root / file).exists():
             train, test = _attach_bodies(root / file, field, train, test)
@@ -42,6 +41,12 @@ def read_nuisi(root: Path) -> Dataset:
         test=tuple(test),
         checksum=file_checksum(path),
     )
+
+
+def read_file(path: Path) -> tuple[list[Trial], list[Trial]]:
+    """The training and the test trials of a NuiSI `traj_data.npz`: right arms of both persons, (T, 18) each."""
+    arrays = load_npz(path, TRAJECTORY_ARRAYS)
+    return _read_split(path, "train", arrays), _read_split(path, "test", arrays)
 
 
 def _read_split(path: Path, split: str, arrays: dict[str, np.ndarray]) -> list[Trial]:

@@ -57,7 +57,7 @@ def windows(features: Float[np.ndarray, "T F"]) -> Float[np.ndarray, "N FW"]:
     if n_frames < WINDOW:
         raise UserError(f"a recording of {n_frames} frames has no window; expected at least {WINDOW} frames")
     view = np.lib.stride_tricks.sliding_window_view(features, WINDOW, axis=0)
-    rows = view.transpose(0, 2, 1).reshape(n_frames - WINDOW + 1, WINDOW * n_features)
+    rows = view.transpose(0, 2, 1).reshape(n_frames - WINDOW + 1, WINDOW * n_features).copy()
     rows[np.isnan(rows).any(axis=1)] = np.nan
     return rows
 
@@ -76,8 +76,6 @@ def pair_windows(
     that follow (joints, or any other per-frame numbers of the partner). Rows with a missing frame are NaN.
     """
     n_frames = len(human)
-    if len(robot) != n_frames:
-        raise UserError(f"human has {n_frames} frames and robot {len(robot)}; expected equal numbers")
     if n_frames < MIN_FRAMES:
         raise UserError(f"a trial of {n_frames} frames has no pair of windows; expected at least {MIN_FRAMES}")
     return human_windows(human)[:-WINDOW], windows(robot)[WINDOW:]

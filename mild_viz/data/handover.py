@@ -1,0 +1,119 @@
+"""Real one-handed handovers between two people, whole bodies (ZED body-34) in one world frame.
+
+The receiver is the human, the giver the partner. Arms are right shoulder, elbow and wrist: of the four pairs
+of wrists it is the two right ones that come closest, in each of the 200 trials. The receiver walks up to the
+giver during a trial, so that the receiver's own frame, which the first frame sets, stays behind;
+`T_world_human` and `T_world_partner` say where the frames are.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.data.checks import file_checksum
+from mild_viz.data.npz import load_npz
+from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, joint_indices, person_frame, to_frame
+from mild_viz.data.windows import MIN_FRAMES
+from mild_viz.errors import UserError
+from mild_viz.trial import Dataset, Skeleton, Trial
+
+FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
+ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
+REFERENCE_JOINTS = ("left_shoulder", "right_shoulder", "pelvis", "neck")
+"""What sets a person's own frame: ZED's neck stands where Nuitrack has the collar, between the shoulders."""
+
+MIN_UPRIGHT = 0.8
+"""Least mean share of the direction from pelvis to head that must lie along one axis for it to be 'up'."""
+
+
+def read_handover(root: Path) -> Dataset:
+    """The handovers from `root`. The world is turned so that z is up, if it is not already."""
+    paths = {split: Path(root) / file for split, file in FILES.items()}
+    return Dataset(
+        name="handover",
+        title="Handovers: one person hands an object to another (ZED body-34, 30 Hz)",
+        train=tuple(read_file(paths["train"], "train")),
+        test=tuple(read_file(paths["test"], "test")),
+        checksum=file_checksum(*paths.values()),
+    )
+
+
+def read_file(path: Path, split: str) -> list[Trial]:
+    """The trials of one file: bodies (N, 34, 3) [m], trial after trial; trial i begins at frame `offsets[i]`."""
+    arrays = load_npz(path, ARRAYS)
+    receiver, giver = (_check_body(path, name, arrays[name]) for name in ("receiver", "giver"))
+    offsets, rate = _check_layout(path, arrays["offsets"], arrays["rate_hz"], len(receiver), len(giver))
+    turn = _turn_upright(path, np.concatenate([receiver, giver]))
+    receiver, giver = receiver @ turn.T, giver @ turn.T
+    trials = []
+    for index, (first, last) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
+        try:
+            T_world_human, human = _own_frame(receiver[first:last])
+            T_world_partner, partner = _own_frame(giver[first:last])
+        except UserError as error:
+            raise UserError(f"{path}: {split} trial {index}: {error}") from error
+        arm = joint_indices(ZED_JOINTS, ARM_JOINTS)
+        trials.append(
+            Trial(
+                dataset="handover",
+                split=split,
+                index=index,
+                action="handover",
+                rate=rate,
+                human_arm=human.positions[:, arm],
+                partner_arm=partner.positions[:, arm],
+                human_skeleton=human,
+                partner_skeleton=partner,
+                T_world_human=T_world_human,
+                T_world_partner=T_world_partner,
+            )
+        )
+    return trials
+
+
+def _check_body(path: Path, name: str, body: np.ndarray) -> Float[np.ndarray, "N 34 3"]:
+    if body.ndim != 3 or body.shape[1:] != (len(ZED_JOINTS), 3) or body.dtype.kind != "f":
+        raise UserError(f"{path}: {name} is {body.dtype} of shape {body.shape}; expected (N, {len(ZED_JOINTS)}, 3)")
+    if np.isinf(body).any():
+        raise UserError(f"{path}: {name} has an infinite coordinate; expected finite or NaN (a gap)")
+    return body.astype(np.float64)
+
+
+def _check_layout(path: Path, offsets: Any, rate: Any, *lengths: int) -> tuple[list[int], float]:
+    n_frames = lengths[0]
+    if any(length != n_frames for length in lengths):
+        raise UserError(f"{path}: receiver and giver have {lengths} frames; expected equal numbers")
+    if offsets.ndim != 1 or offsets.dtype.kind not in "iu" or len(offsets) < 2:
+        raise UserError(f"{path}: offsets is {offsets.dtype} of shape {offsets.shape}; expected trial limits, integers")
+    if offsets[0] != 0 or offsets[-1] != n_frames or np.diff(offsets).min() < MIN_FRAMES:
+        raise UserError(
+            f"{path}: offsets run from {offsets[0]} to {offsets[-1]}; expected 0 to {n_frames} "
+            f"in steps of at least {MIN_FRAMES} frames"
+        )
+    if np.ndim(rate) != 0 or not np.isfinite(rate) or rate <= 0:
+        raise UserError(f"{path}: rate_hz is {rate}; expected one number above 0")
+    return offsets.tolist(), float(rate)
+
+
+def _turn_upright(path: Path, bodies: Float[np.ndarray, "N 34 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that brings the recording's up axis, along which people stand, to z."""
+    head, pelvis = joint_indices(ZED_JOINTS, ("head", "pelvis"))
+    upward = np.nanmean(bodies[:, head] - bodies[:, pelvis], axis=0)
+    upward /= np.linalg.norm(upward)
+    axis = int(np.abs(upward).argmax())
+    if not abs(upward[axis]) > MIN_UPRIGHT:
+        raise UserError(
+            f"{path}: heads are above pelvises along {np.round(upward, 2)}; expected mostly one axis of the world"
+        )
+    turn = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3, axis]]
+    return turn if upward[axis] > 0 else np.diag([-1.0, 1.0, -1.0]) @ turn
+
+
+def _own_frame(body: Float[np.ndarray, "T 34 3"]) -> tuple[Float[np.ndarray, "4 4"], Skeleton]:
+    """T_world_person from the first frame, and the body in that frame."""
+    T_world_person = person_frame(*body[0, joint_indices(ZED_JOINTS, REFERENCE_JOINTS)])
+    return T_world_person, Skeleton(ZED_JOINTS, ZED_BONES, to_frame(T_world_person, body))
