@@ -1,0 +1,165 @@
+"""The controlled arm: its fixed offsets folded from pytorch-kinematics' parse, cached on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.errors import UserError
+from mild_viz.robot.description import TURNING, Description
+from mild_viz.trial import freeze_arrays
+
+FOLD_VERSION = 1
+"""Raise it whenever the fold changes, so that older caches are not used."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmChain:
+    """J turning joints between the base and the end effector, everything fixed in between folded.
+
+    The end effector's pose is offsets[0] R(axes[0], q[0]) offsets[1] ... R(axes[J-1], q[J-1]) offsets[J].
+    """
+
+    joint_names: tuple[str, ...]
+    end_effector: str
+    lower: Float[np.ndarray, " J"]
+    upper: Float[np.ndarray, " J"]
+    rest: Float[np.ndarray, " J"]
+    """Where the joints stand when nothing moves them [rad]."""
+    offsets: Float[np.ndarray, "J+1 4 4"]
+    axes: Float[np.ndarray, "J 3"]
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.joint_names)
+
+    @cached_property
+    def arm(self) -> Float[np.ndarray, "J+1 12"]:
+        """The arm as the kernels take it (see `kernels`). Writable, because numba types read-only arrays apart."""
+        arm = np.zeros((self.n_joints + 1, 12))
+        arm[:, :4] = quaternions(self.offsets[:, :3, :3])
+        arm[:, 4:7] = self.offsets[:, :3, 3]
+        arm[:-1, 7:10], arm[:-1, 10], arm[:-1, 11] = self.axes, self.lower, self.upper
+        return arm
+
+    @cached_property
+    def shoulder(self) -> Float[np.ndarray, "3"]:
+        """Where the first joint is, in the base frame [m]."""
+        return self.offsets[0, :3, 3]
+
+    @cached_property
+    def reach(self) -> float:
+        """Longest distance from the first joint to the end effector that the links allow [m]."""
+        return float(np.linalg.norm(self.offsets[1:, :3, 3], axis=1).sum())
+
+
+def quaternions(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
+    """Unit quaternions (wxyz, w >= 0) of N rotation matrices."""
+    from scipy.spatial.transform import Rotation
+
+    return np.ascontiguousarray(Rotation.from_matrix(rotations).as_quat(canonical=True)[:, [3, 0, 1, 2]])
+
+
+def kernel_array(values: np.ndarray) -> np.ndarray:
+    """The array as float64, contiguous and writable, so that every call meets the same compiled kernel."""
+    return np.require(values, dtype=np.float64, requirements=["C", "W"])
+
+
+def load_chain(
+    description: Description, joint_names: tuple[str, ...], end_effector: str, rest: dict[str, float]
+) -> ArmChain:
+    """The chain of `joint_names` up to `end_effector`; joints in between that are not named rest.
+
+    Raises `UserError` where a joint or the end effector is missing, where a joint does not turn, or where
+    it is not between the base and the end effector in the given order.
+    """
+    description.require_link(end_effector)
+    joints = [description.joint(name) for name in joint_names]
+    for joint in joints:
+        if joint.kind not in TURNING or joint.mimic is not None:
+            kind = "mimic" if joint.mimic is not None else joint.kind
+            raise UserError(f"{description.path}: joint '{joint.name}' is {kind}; a controlled joint must turn freely")
+    between = [joint.name for joint in description.path_to(end_effector)]
+    if [name for name in between if name in joint_names] != list(joint_names):
+        raise UserError(
+            f"{description.path}: joints {', '.join(joint_names)} are not in this order between the base and "
+            f"'{end_effector}'; there are: {', '.join(between)}"
+        )
+    values = description.values(rest)
+    offsets, axes = _cached_fold(description, joint_names, end_effector, values)
+    lower, upper = np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+    resting = np.array([values[name] for name in joint_names])
+    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, offsets, axes)
+
+
+def cache_folder() -> Path:
+    """Where folded chains are kept: the user's cache folder."""
+    import pooch
+
+    return Path(pooch.os_cache("mild_viz")) / "chains"
+
+
+def _cached_fold(
+    description: Description, joint_names: tuple[str, ...], end_effector: str, values: dict[str, float]
+) -> tuple[Float[np.ndarray, "J+1 4 4"], Float[np.ndarray, "J 3"]]:
+    """`_fold`, read from the cache where it is there and sound, else computed and kept there if possible."""
+    resting = [(joint.name, values[joint.name]) for joint in description.path_to(end_effector)]
+    question = json.dumps([FOLD_VERSION, description.digest, joint_names, end_effector, resting])
+    file = cache_folder() / f"{hashlib.sha256(question.encode()).hexdigest()}.npz"
+    n = len(joint_names)
+    with contextlib.suppress(Exception):  # missing or damaged in whatever way: fold again
+        with np.load(file, allow_pickle=False) as arrays:
+            offsets, axes = arrays["offsets"], arrays["axes"]
+        if offsets.shape == (n + 1, 4, 4) and axes.shape == (n, 3) and np.isfinite(offsets).all():
+            return offsets, axes
+    offsets, axes = _fold(description, joint_names, end_effector, values)
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as temporary:
+            np.savez(temporary, offsets=offsets, axes=axes)
+        os.replace(temporary.name, file)
+    return offsets, axes
+
+
+def _fold(
+    description: Description, joint_names: tuple[str, ...], end_effector: str, values: dict[str, float]
+) -> tuple[Float[np.ndarray, "J+1 4 4"], Float[np.ndarray, "J 3"]]:
+    """Multiply the fixed transforms between controlled joints, as pytorch-kinematics parses them."""
+    import pytorch_kinematics as pk  # slow: it imports torch
+
+    content = description.path.read_bytes()
+    with contextlib.redirect_stderr(io.StringIO()):  # its parser prints a line for every tag it does not know
+        frames = pk.build_serial_chain_from_urdf(content, end_effector, description.root)._serial_frames
+    fixed = {joint.name: joint for joint in description.joints}
+    offsets, axes = [np.eye(4)], []
+    for frame in frames:
+        if frame.joint.offset is not None:
+            offsets[-1] = offsets[-1] @ _unit(frame.joint.offset.get_matrix()[0].double().numpy())
+        if frame.joint.name in joint_names:
+            axis = frame.joint.axis.double().numpy()
+            axes.append(axis / np.linalg.norm(axis))
+            offsets.append(np.eye(4))
+        elif frame.joint.joint_type != "fixed":
+            joint = fixed[frame.joint.name]
+            offsets[-1] = offsets[-1] @ np.linalg.inv(joint.origin) @ joint.motion(values[joint.name])
+    return np.array(offsets), np.array(axes)
+
+
+def _unit(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The transform with its rotation made orthogonal again (it was parsed in float32)."""
+    u, _, v = np.linalg.svd(transform[:3, :3])
+    transform[:3, :3] = u @ v
+    return transform

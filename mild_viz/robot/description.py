@@ -1,0 +1,157 @@
+"""A robot description: the links and joints of a URDF file, as the file states them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.errors import UserError
+
+if TYPE_CHECKING:
+    import yourdfpy
+
+TURNING = ("revolute", "continuous")
+"""Joint types that can be controlled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """One joint: the child's frame is the parent's, moved by `origin` and then turned (or slid) about `axis`."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, "3"]
+    lower: float
+    upper: float
+    mimic: tuple[str, float, float] | None
+    """(joint, multiplier, offset) where this joint follows another one."""
+
+    def motion(self, value: float) -> Float[np.ndarray, "4 4"]:
+        """Pose of the child in the parent at joint value `value` [rad or m]."""
+        moved = np.eye(4)
+        if self.kind in TURNING:
+            x, y, z = self.axis
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            moved[:3, :3] += np.sin(value) * cross + (1.0 - np.cos(value)) * cross @ cross
+        elif self.kind == "prismatic":
+            moved[:3, 3] = value * self.axis
+        return self.origin @ moved
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A parsed URDF. `joints` are ordered so that parents come first."""
+
+    path: Path
+    digest: str
+    """SHA-256 of the file."""
+    root: str
+    joints: tuple[Joint, ...]
+    urdf: yourdfpy.URDF
+    """The parse that the visuals are loaded from (without meshes)."""
+
+    def joint(self, name: str) -> Joint:
+        """The joint of that name; `UserError` listing the joints that turn where there is none."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        have = ", ".join(joint.name for joint in self.joints if joint.kind in TURNING and joint.mimic is None)
+        raise UserError(f"{self.path} has no joint '{name}'; it has: {have or 'none that turns'}")
+
+    def require_link(self, name: str) -> None:
+        """`UserError` listing the links where there is none of that name."""
+        links = (self.root, *(joint.child for joint in self.joints))
+        if name not in links:
+            raise UserError(f"{self.path} has no link '{name}'; it has: {', '.join(links)}")
+
+    def path_to(self, link: str) -> tuple[Joint, ...]:
+        """Joints from the root to a link."""
+        above = {joint.child: joint for joint in self.joints}
+        joints = []
+        while link in above:
+            joints.append(above[link])
+            link = above[link].parent
+        return tuple(reversed(joints))
+
+    def values(self, chosen: dict[str, float]) -> dict[str, float]:
+        """Value of every joint [rad or m]: as chosen (else 0) within its limits; mimic joints follow."""
+        values = {joint.name: float(np.clip(chosen.get(joint.name, 0.0), joint.lower, joint.upper))
+                  for joint in self.joints if joint.mimic is None}  # fmt: skip
+        for joint in self.joints:
+            if joint.mimic is not None:
+                source, multiplier, offset = joint.mimic
+                values[joint.name] = multiplier * values.get(source, 0.0) + offset
+        return values
+
+
+def read_description(path: Path) -> Description:
+    """Parse a URDF file. Raises `UserError` where it is no well-formed tree of links and joints."""
+    import yourdfpy
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}; expected a URDF description") from error
+    try:
+        # parsed here first, because yourdfpy would go on with whatever it can recover
+        element = etree.fromstring(content, etree.XMLParser(resolve_entities=False, no_network=True))
+        if element.tag != "robot":
+            raise UserError(f"{path}: the root element is <{element.tag}>; expected a URDF description, <robot>")
+        urdf = yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False)
+        joints = [_convert(joint) for joint in urdf.robot.joints]
+    except (etree.XMLSyntaxError, AttributeError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path} is not a valid URDF description: {error}") from error
+    links = [link.name for link in urdf.robot.links]
+    return Description(path, hashlib.sha256(content).hexdigest(), *_sort(path, links, joints), urdf)
+
+
+def _convert(joint: yourdfpy.Joint) -> Joint:
+    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
+    axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else np.asarray(joint.axis, dtype=np.float64)
+    if joint.type in (*TURNING, "prismatic"):
+        length = float(np.linalg.norm(axis))
+        if not length > 0.0:
+            raise ValueError(f"joint {joint.name} has the axis {axis.tolist()}")
+        axis = axis / length
+    lower, upper = -np.inf, np.inf
+    if joint.limit is not None and joint.type in ("revolute", "prismatic"):
+        lower = 0.0 if joint.limit.lower is None else float(joint.limit.lower)
+        upper = 0.0 if joint.limit.upper is None else float(joint.limit.upper)
+        if not lower <= upper:
+            raise ValueError(f"joint {joint.name} has the limits {lower} to {upper}")
+    mimic = None
+    if joint.mimic is not None:
+        multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
+        mimic = (joint.mimic.joint, multiplier, float(joint.mimic.offset or 0.0))
+    return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, mimic)
+
+
+def _sort(path: Path, links: list[str], joints: list[Joint]) -> tuple[str, tuple[Joint, ...]]:
+    """Root link, and the joints with parents first; `UserError` where they form no single tree."""
+    children = [joint.child for joint in joints]
+    roots = [link for link in links if link not in children]
+    ends = {joint.parent for joint in joints} | set(children)
+    if len(roots) != 1 or len(set(children)) != len(children) or not ends <= set(links):
+        raise UserError(f"{path}: the links form no single tree; roots: {', '.join(roots) or 'none'}")
+    below: dict[str, list[Joint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    ordered: list[Joint] = []
+    waiting = [roots[0]]
+    while waiting:
+        for joint in below.get(waiting.pop(), []):
+            ordered.append(joint)
+            waiting.append(joint.child)
+    if len(ordered) != len(joints):
+        raise UserError(f"{path}: the joints form a loop; expected a tree from '{roots[0]}'")
+    return roots[0], tuple(ordered)

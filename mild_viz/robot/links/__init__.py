@@ -1,0 +1,1 @@
+"""Poses of the links that are drawn."""
