@@ -80,7 +80,9 @@ class Checkpoint:
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""
         if self.robot is None:
-            raise UserError(f"checkpoint {self.name} is a human-human model and drives no robot; train --stage hri first")
+            raise UserError(
+                f"checkpoint {self.name} is a human-human model and drives no robot; train --stage hri first"
+            )
         return self.robot
 
 

@@ -161,7 +161,9 @@ def import_published(file: Path, out: Path) -> Checkpoint:
         variant = variant_of(arguments)
         n_joints, latent = int(arguments["num_joints"]), int(arguments["latent_dim"])
         if n_joints != len(PEPPER_JOINTS):
-            raise UserError(f"{file} drives {n_joints} joints; only Pepper models ({len(PEPPER_JOINTS)}) can be imported")
+            raise UserError(
+                f"{file} drives {n_joints} joints; only Pepper models ({len(PEPPER_JOINTS)}) can be imported"
+            )
         human_vae = _vae(content["model_h"], WINDOW * 18, latent, f"{file}: model_h")
         robot_vae = _vae(content["model_r"], WINDOW * n_joints, latent, f"{file}: model_r")
         hmms = {a: _hmm(ssm.state, f"{file}: ssm {a}") for a, ssm in zip(ACTIONS, content["ssm"], strict=True)}

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mild_viz.settings import Placement
 from mild_viz.trial import Skeleton, freeze_arrays
 
 SAVED = (
@@ -114,8 +115,8 @@ class Rollout:
     state_occupancy: Float[np.ndarray, " S"]
     """Share of the trial in which each state is active."""
     contact_states: frozenset[int]
-    placement_source: str
-    """Where the placement of the human comes from, in words for the page."""
+    placement: Placement
+    """Where the human stands, and in words for the page where that comes from."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

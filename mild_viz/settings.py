@@ -84,8 +84,8 @@ class ControlSettings:
     """Weight of reaching the target (Eq. ik-prior-simplified)."""
     lambda_q: float = 0.01
     """Weight of staying at the decoded joints (Eq. ik-prior-simplified)."""
-    contact_states: frozenset[int] = frozenset()
-    """HMM states in which the partners touch, for the trial's action."""
+    contact_states: frozenset[int] | None = None
+    """HMM states in which the partners touch, for the trial's action; None: the checkpoint's own."""
     stiffness: bool = True
     """Lower the stiffness in contact (handshake)."""
     smoothing: float = 0.8

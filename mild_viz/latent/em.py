@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.latent import kernels
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, safe_log
+from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows, safe_log
 
 TRANSITION_FLOOR = 1e-6
 """Smallest transition probability: a state that was never left can still be left."""
@@ -23,13 +23,14 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "T D"]], n_states: int,
     parts = [[] for _ in range(n_states)]
     for sequence in sequences:
         for state, part in enumerate(np.array_split(sequence, n_states)):
-            parts[state].append(part)
+            parts[state].append(part[observed_rows(part)])
     pooled = [np.concatenate(part) for part in parts]
     stay = 1.0 - n_states / np.mean([len(sequence) for sequence in sequences])
     transition = np.full((n_states, n_states), TRANSITION_FLOOR)
-    for state in range(n_states):
+    for state in range(n_states - 1):
         transition[state, state] = stay
-        transition[state, (state + 1) % n_states] += 1.0 - stay
+        transition[state, state + 1] = 1.0 - stay
+    transition[-1, -1] = 1.0
     initial = np.full(n_states, TRANSITION_FLOOR)
     initial[0] = 1.0
     return HMM(
@@ -67,6 +68,9 @@ def em_step(hmm: HMM, sequences: Sequence[Float[np.ndarray, "T D"]], floor: floa
         total += log_probability
         start += len(sequence)
 
+    # Steps without an observation carry the recursion on but say nothing about the emissions.
+    seen = observed_rows(stacked)
+    stacked, gamma = stacked[seen], gamma[seen]
     mass = gamma.sum(0)
     safe_mass = np.maximum(mass, 1e-12)
     means = (gamma.T @ stacked) / safe_mass[:, None]

@@ -39,7 +39,10 @@ def condition(
     else:
         posterior = np.zeros((len(human_mean), 1, size, size))
         posterior[:, 0, range(size), range(size)] = np.where(observed[:, None], human_std, 0.0) ** 2
-        gain = np.linalg.solve(cov_hh + posterior, np.broadcast_to(cov_rh.transpose(0, 2, 1), (len(human_mean), *cov_rh.transpose(0, 2, 1).shape)))
+        gain = np.linalg.solve(
+            cov_hh + posterior,
+            np.broadcast_to(cov_rh.transpose(0, 2, 1), (len(human_mean), *cov_rh.transpose(0, 2, 1).shape)),
+        )
         gain = gain.transpose(0, 1, 3, 2)  # N S R H
         means = mean_r + (gain @ deviation[..., None])[..., 0]
         reduction = (gain @ cov_rh.transpose(0, 2, 1)) * observed[:, None, None, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -38,6 +39,15 @@ class HMM:
     def n_states(self) -> int:
         return len(self.initial_probs)
 
+    @cached_property
+    def whitening(self) -> tuple[Float[np.ndarray, "S D D"], Float[np.ndarray, "S D"], Float[np.ndarray, " S"]]:
+        """Per state W, b, c such that log N(z; mu, Sigma) = c - |W z - b|^2 / 2."""
+        factors = np.linalg.cholesky(self.emission_covariances)
+        inverse = np.linalg.inv(factors)
+        log_det = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+        offsets = (inverse @ self.emission_means[..., None])[..., 0]
+        return inverse, offsets, -log_det - 0.5 * self.emission_means.shape[1] * np.log(2 * np.pi)
+
     def marginal(self, dimensions: slice) -> HMM:
         """The model of some of the latent dimensions alone."""
         return HMM(
@@ -51,7 +61,9 @@ class HMM:
 def check_hmm(hmm: HMM, where: str) -> HMM:
     """Return `hmm` if it is a valid model, else raise an error that says what is wrong."""
     if not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6) or (hmm.transition_matrix < 0).any():
-        raise UserError(f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})")
+        raise UserError(
+            f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})"
+        )
     if not np.isclose(hmm.initial_probs.sum(), 1.0, atol=1e-6) or (hmm.initial_probs < 0).any():
         raise UserError(f"{where}: initial_probs are not probabilities (sum {hmm.initial_probs.sum()})")
     lowest = np.linalg.eigvalsh(hmm.emission_covariances).min()
@@ -62,14 +74,11 @@ def check_hmm(hmm: HMM, where: str) -> HMM:
 
 def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N S"]:
     """log N(z_n; mu_i, Sigma_i). A row of `z` with NaN is a missing observation and gives a row of zeros."""
-    factors = np.linalg.cholesky(hmm.emission_covariances)
-    # One triangular inverse a state, then one product for all steps: D is small and N is large.
-    inverse_factors = np.linalg.inv(factors)
-    offsets = np.einsum("sde,se->sd", inverse_factors, hmm.emission_means)
-    whitened = np.einsum("sde,ne->nsd", inverse_factors, z) - offsets
-    log_det = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
-    size = z.shape[1]
-    log_density = -0.5 * (whitened**2).sum(2) - log_det - 0.5 * size * np.log(2 * np.pi)
+    inverse, offsets, constants = hmm.whitening
+    # One matrix product for all states and steps: D is small and N is large.
+    n_states, size, _ = inverse.shape
+    whitened = (z @ inverse.reshape(n_states * size, size).T).reshape(-1, n_states, size) - offsets
+    log_density = constants - 0.5 * (whitened**2).sum(2)
     return np.where(np.isnan(z).any(1)[:, None], 0.0, log_density)
 
 

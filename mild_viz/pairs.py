@@ -1,0 +1,76 @@
+"""What a model learns from: per trial the robot's true motion, and human and partner windows in pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mild_viz.data.windows import fill_gaps, human_windows, max_gap, pair_windows
+from mild_viz.errors import UserError
+from mild_viz.robot.retarget import retarget_pepper
+from mild_viz.settings import WINDOW
+from mild_viz.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Paired windows of several trials. Row r is human window `step[r]` of trial `trial[r]`.
+
+    A row with a frame that could not be filled is NaN throughout, and stays in place so that a trial's
+    rows are consecutive in time.
+    """
+
+    human: Float[np.ndarray, "R X"]
+    partner: Float[np.ndarray, "R Y"]
+    trial: Int[np.ndarray, " R"]
+    step: Int[np.ndarray, " R"]
+    actions: tuple[str, ...]
+    """Action of each trial."""
+
+    def rows(self, trial: int) -> slice:
+        """The rows of one trial."""
+        first, last = np.searchsorted(self.trial, [trial, trial + 1])
+        return slice(int(first), int(last))
+
+
+def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "T J"]:
+    """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to Pepper.
+
+    NaN where the partner was not tracked for longer than a gap that is filled, or where no truth is known.
+    """
+    if trial.robot_joints is not None and tuple(trial.robot_joint_names) == tuple(joint_names):
+        return trial.robot_joints
+    if trial.partner_arm is not None and len(joint_names) == 4:
+        return retarget_pepper(fill_gaps(trial.partner_arm, max_gap(trial.rate)))
+    raise UserError(
+        f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
+        f"it has {', '.join(trial.robot_joint_names) or 'no recorded robot'}"
+    )
+
+
+def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
+    """Windows of all trials; the partner is the robot with `joint_names`, or the second human if None."""
+    humans, partners, indices, steps = [], [], [], []
+    for index, trial in enumerate(trials):
+        arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
+        if joint_names is not None:
+            human, partner = pair_windows(arm, robot_truth(trial, joint_names))
+        elif trial.partner_arm is not None:
+            human = human_windows(arm)[:-WINDOW]
+            partner = human_windows(fill_gaps(trial.partner_arm, max_gap(trial.rate)))[WINDOW:]
+        else:
+            raise UserError(f"trial {trial.name} has no second human")
+        humans.append(human)
+        partners.append(partner)
+        indices.append(np.full(len(human), index))
+        steps.append(np.arange(len(human)))
+    return Windows(
+        np.concatenate(humans),
+        np.concatenate(partners),
+        np.concatenate(indices),
+        np.concatenate(steps),
+        tuple(trial.action for trial in trials),
+    )

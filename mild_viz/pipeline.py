@@ -1,0 +1,156 @@
+"""The whole chain on one page: encode -> filter -> condition -> decode, then gate -> IK -> smooth -> stiffness.
+
+`infer` depends on model, variant and trial; `control` on everything that a person may turn while watching.
+Both are pure functions: a page, a command or a test calls them alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.checkpoint import Checkpoint
+from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
+from mild_viz.errors import UserError
+from mild_viz.latent.gmr import condition
+from mild_viz.latent.hmm import forward_filter, log_emission, unobserved_forward
+from mild_viz.pairs import robot_truth
+from mild_viz.robot.contact import in_frame
+from mild_viz.robot.controller import initial_carry, run_controller
+from mild_viz.robot.model import RobotModel
+from mild_viz.robot.placement import place_human
+from mild_viz.rollout import Inference, Rollout
+from mild_viz.settings import VARIANTS, WINDOW, ControlSettings
+from mild_viz.trial import Skeleton, Trial
+
+NEWEST = WINDOW - 1
+"""Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
+
+
+def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
+    """What the model says about a trial: Algorithm vae-HMM-test up to the decoded joints.
+
+    Raises:
+        UserError: if the checkpoint does not know the variant or the action, or the trial is too short.
+    """
+    robot_vae = checkpoint.robot_vae(variant)
+    interface = checkpoint.for_robot()
+    hmm = checkpoint.hmm(trial.action)
+    size = checkpoint.human_vae.latent_size
+    human, robot = slice(0, size), slice(size, 2 * size)
+    n_windows = trial.n_frames - 2 * WINDOW + 1
+    if n_windows < 1:
+        raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")
+
+    arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
+    mean, std = checkpoint.human_vae.encode(human_windows(arm)[:n_windows])
+    truth = robot_truth(trial, interface.joint_names)
+    truth_windows = windows(truth)[WINDOW:]
+    latent_truth, _ = robot_vae.encode(truth_windows)
+
+    human_hmm = hmm.marginal(human)
+    log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean))
+    log_alpha_joint, _ = forward_filter(hmm, log_emission(hmm, np.concatenate([mean, latent_truth], axis=1)))
+    covariance_std = std if VARIANTS[variant].posterior_covariance else None
+    robot_mean, robot_covariance = condition(hmm, mean, log_alpha, covariance_std)
+    decoded = robot_vae.decode(robot_mean)
+
+    newest = slice(NEWEST, NEWEST + n_windows)
+    n_joints = len(interface.joint_names)
+    return Inference(
+        dataset=trial.dataset,
+        split=trial.split,
+        trial=trial.index,
+        action=trial.action,
+        variant=variant,
+        rate=trial.rate,
+        joint_names=interface.joint_names,
+        time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
+        observed=~np.isnan(mean).any(1),
+        log_alpha_human=log_alpha,
+        log_alpha_joint=log_alpha_joint,
+        log_alpha_unobserved=unobserved_forward(hmm, n_windows),
+        active_state=log_alpha.argmax(1),
+        human_latent_mean=mean,
+        human_latent_covariance=(std**2)[:, :, None] * np.eye(size),
+        robot_latent_mean=robot_mean,
+        robot_latent_covariance=robot_covariance,
+        robot_latent_truth=latent_truth,
+        joints_decoded=decoded[:, :n_joints],
+        joints_truth=truth[WINDOW : WINDOW + n_windows],
+        window_error=((decoded - truth_windows) ** 2).mean(1),
+        human_state_means=hmm.emission_means[:, human],
+        human_state_covariances=hmm.emission_covariances[:, human, human],
+        robot_state_means=hmm.emission_means[:, robot],
+        robot_state_covariances=hmm.emission_covariances[:, robot, robot],
+        human_arm=trial.human_arm[newest],
+        human_hand=arm[newest, 2],
+        human_skeleton=_rows_of(trial.human_skeleton, newest),
+        phase=None if trial.phase is None else trial.phase[newest],
+    )
+
+
+def control(
+    inference: Inference, checkpoint: Checkpoint, robot: RobotModel, trial: Trial, settings: ControlSettings
+) -> Rollout:
+    """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
+    settings = with_contact_states(settings, checkpoint, inference.action)
+    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
+    target = in_frame(placed.T_world_human, inference.human_hand)
+    result = run_controller(
+        robot.chain,
+        settings,
+        inference.action,
+        inference.log_alpha_human,
+        inference.joints_decoded,
+        target,
+        initial_carry(robot.chain),
+    )
+    end_effector = robot.end_effector(result.joints)
+    durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
+    return Rollout(
+        inference=inference,
+        controller=settings.controller,
+        robot=robot.name,
+        joints_commanded=result.joints,
+        end_effector=end_effector,
+        end_effector_decoded=robot.end_effector(inference.joints_decoded),
+        target=target,
+        hand_distance=np.linalg.norm(end_effector - target, axis=1),
+        contact=result.contact,
+        stiffness=result.stiffness,
+        T_world_human=placed.T_world_human,
+        link_names=robot.link_names,
+        link_poses=robot.link_poses(result.joints),
+        link_poses_decoded=robot.link_poses(inference.joints_decoded),
+        state_durations=durations,
+        state_occupancy=occupancy,
+        contact_states=settings.contact_states or frozenset(),
+        placement=placed.placement,
+    )
+
+
+def with_contact_states(settings: ControlSettings, checkpoint: Checkpoint, action: str) -> ControlSettings:
+    """The settings with contact states filled in: the chosen ones, else the checkpoint's for the action."""
+    if settings.contact_states is None:
+        return replace(settings, contact_states=checkpoint.contact_states.get(action, frozenset()))
+    bad = sorted(state for state in settings.contact_states if not 0 <= state < checkpoint.n_states)
+    if bad:
+        raise UserError(f"contact states {bad} do not exist; valid: 0 to {checkpoint.n_states - 1}")
+    return settings
+
+
+def state_visits(
+    active: np.ndarray, n_states: int, rate: float
+) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
+    """Mean length of a visit to each state [s], and the share of time spent in it."""
+    starts = np.flatnonzero(np.diff(active, prepend=-1))
+    visits = np.bincount(active[starts], minlength=n_states)
+    steps = np.bincount(active, minlength=n_states)
+    return steps / np.maximum(visits, 1) / rate, steps / len(active)
+
+
+def _rows_of(skeleton: Skeleton | None, rows: slice) -> Skeleton | None:
+    return None if skeleton is None else Skeleton(skeleton.joint_names, skeleton.bones, skeleton.positions[rows])

@@ -1,0 +1,34 @@
+"""What decides a training run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Sizes, schedule and weights of both stages. Saved with every checkpoint."""
+
+    seed: int = 0
+    seeds: int = 4
+    """How many models are trained together; the best by held-out trials is kept."""
+    hidden: tuple[int, int] = (40, 20)
+    latent_size: int = 5
+    n_states: int = 6
+    human_epochs: int = 60
+    robot_epochs: int = 60
+    batch_size: int = 256
+    learning_rate: float = 5e-4
+    peak_learning_rate: float = 4e-3
+    """Top of the one-cycle schedule."""
+    beta: float = 5e-3
+    """Weight of the KL term (Eq. elbo)."""
+    covariance_floor: float = 1e-3
+    """Added to the diagonal of every HMM covariance [latent units squared]."""
+    em_every: int = 5
+    """The HMMs are fitted anew after every epoch of the first ten, then every so many epochs."""
+    em_iterations: int = 10
+    final_em_iterations: int = 50
+    gradient_clip: float = 10.0
+    held_out: int = 1
+    """Trials of every action that are kept from training, to choose among the seeds."""

@@ -1,0 +1,222 @@
+"""One training run from recordings to a checkpoint folder: what `mild-viz train` does."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mild_viz.checkpoint import Checkpoint, RobotInterface, load_checkpoint, save_checkpoint
+from mild_viz.data.load import load_dataset
+from mild_viz.errors import UserError
+from mild_viz.evaluation.metrics import Row, model_rows
+from mild_viz.pairs import stack_windows
+from mild_viz.pipeline import NEWEST, infer
+from mild_viz.robot.contact import contact_frames, suggest_contact_states
+from mild_viz.robot.model import load_robot
+from mild_viz.robot.placement import estimate_placement
+from mild_viz.robot.robots import ROBOTS
+from mild_viz.settings import VARIANTS, choose
+from mild_viz.training.human_stage import train_human_stage
+from mild_viz.training.options import TrainingOptions
+from mild_viz.training.robot_stage import train_robot_stage
+from mild_viz.training.state import RunState
+from mild_viz.trial import Dataset, Trial
+
+ROBOT = "pepper"
+"""The robot that models are trained for: the one whose joints can be retargeted from a second human."""
+
+
+def hold_out(trials: Sequence[Trial], n_held: int) -> tuple[list[Trial], list[Trial]]:
+    """Split training trials into those to fit and the last `n_held` of every action, to choose a seed by.
+
+    An action with fewer than three trials keeps all of them.
+    """
+    held: set[int] = set()
+    for action in dict.fromkeys(trial.action for trial in trials):
+        of_action = [i for i, trial in enumerate(trials) if trial.action == action]
+        if n_held and len(of_action) >= n_held + 2:
+            held.update(of_action[-n_held:])
+    fit = [trial for i, trial in enumerate(trials) if i not in held]
+    return fit, [trials[i] for i in sorted(held)]
+
+
+def mean_error(rows: Sequence[Row], variant: str) -> float:
+    """A variant's error, averaged over actions."""
+    return float(np.mean([row.mse_mean for row in rows if row.model == variant]))
+
+
+def choose_seed(candidates: Sequence[Checkpoint], held: Sequence[Trial]) -> tuple[int, list[dict[str, float]]]:
+    """The candidate with the lowest error on held-out trials, and every candidate's errors by variant.
+
+    Averaged over the variants with conditional training: they are what a robot runs, and v1's error, an order
+    larger, would decide alone.
+    """
+    if not held:
+        return 0, []
+    scores = []
+    for candidate in candidates:
+        rows = model_rows(candidate, held)
+        scores.append({model: mean_error(rows, model) for model in dict.fromkeys(row.model for row in rows)})
+    deciding = [name for name in scores[0] if VARIANTS[name].conditional_training != "none"] or list(scores[0])
+    return int(np.argmin([np.mean([score[name] for name in deciding]) for score in scores])), scores
+
+
+def train(
+    dataset: str,
+    stage: str = "hri",
+    variants: Sequence[str] = tuple(VARIANTS),
+    seeds: int = 4,
+    epochs: int | None = None,
+    out: Path = Path("runs/model"),
+    resume: bool = False,
+    seed: int = 0,
+) -> Checkpoint:
+    """Train a model and write its folder; the stages' state lives beside it until the folder is written.
+
+    Raises:
+        UserError: on an unknown dataset, stage or variant, a dataset without a second human, a run that cannot
+            be resumed, or a folder that holds something else.
+    """
+    choose("stage", stage, ("hhi", "hri"))
+    variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
+    if seeds < 1 or (epochs is not None and epochs < 1):
+        raise UserError(f"seeds is {seeds} and epochs is {epochs}; both must be at least 1")
+    if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not (out / "config.json").is_file():
+        raise UserError(f"{out} exists and is not a checkpoint folder; choose a new folder with --out")
+    options = TrainingOptions(seeds=seeds, seed=seed)
+    if epochs is not None:
+        options = replace(options, human_epochs=epochs, robot_epochs=epochs)
+    source = load_dataset(dataset)
+    state = RunState(
+        out,
+        {"dataset": dataset, "checksum": source.checksum, "stage": stage, "variants": list(variants)},
+        options,
+        resume,
+    )
+    started = time.monotonic()
+    candidates, held = _train_stages(source, stage, variants, options, state, out)
+    best, scores = choose_seed(candidates, held)
+    chosen = candidates[best]
+    command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
+    command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
+    command += ["--out", f"{out.parent.name}/{out.name}"]
+    training = {
+        "command": shlex.join(command),
+        "seed": seed,
+        "chosen": best,
+        "seconds": round(time.monotonic() - started, 1),
+        "fitted_trials": len(source.train) - len(held),
+        "held_out_trials": [trial.name for trial in held],
+        "options": asdict(options),
+    }
+    # The test split is read here for the first time, for the record only.
+    test = model_rows(chosen, source.test)
+    metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
+    fitted, _ = hold_out(source.train, options.held_out)
+    chosen = replace(chosen, training=training, metrics=metrics)
+    if chosen.robot is not None:
+        chosen = replace(
+            chosen,
+            contact_states=contact_states(chosen, fitted),
+            placement=estimate_placement(load_robot(ROBOT).chain, source.train)[0],
+        )
+    save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
+    state.finish()
+    return load_checkpoint(out)
+
+
+def contact_states(checkpoint: Checkpoint, trials: Sequence[Trial]) -> dict[str, frozenset[int]]:
+    """Per action, the states in which the partners of the training trials touch: a start for a person's choice."""
+    result = {}
+    for action in checkpoint.actions:
+        of_action = [trial for trial in trials if trial.action == action]
+        active = [infer(checkpoint, trial, checkpoint.variants[0]).active_state for trial in of_action]
+        touching = [
+            contact_frames(trial)[NEWEST : NEWEST + len(states)]
+            for trial, states in zip(of_action, active, strict=True)
+        ]
+        result[action] = suggest_contact_states(active, touching, checkpoint.n_states)
+    return result
+
+
+def _train_stages(
+    source: Dataset, stage: str, variants: Sequence[str], options: TrainingOptions, state: RunState, out: Path
+) -> tuple[list[Checkpoint], list[Trial]]:
+    """Both stages with a progress bar each. Returns one candidate a seed, and the held-out trials."""
+    fit, held = hold_out(source.train, options.held_out)
+    human_data = stack_windows(fit, None)
+    # One thread: two are slower than one for networks of this size.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    columns = (
+        TextColumn("{task.description:>6}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[values]}"),
+    )  # fmt: skip
+    try:
+        with Progress(*columns, console=Console(stderr=True)) as bars:
+            tasks = {
+                "human": bars.add_task("human", total=options.human_epochs, values=""),
+                "robot": bars.add_task("robot", total=options.robot_epochs, values="", visible=stage == "hri"),
+            }
+
+            def progress(name: str, epoch: int, _: int, values: dict[str, float]) -> None:
+                text = "  ".join(f"{key} {value:.3f}" for key, value in values.items())
+                bars.update(tasks[name], completed=epoch, values=text)
+
+            humans = train_human_stage(human_data, options, progress, state)
+            if stage == "hri":
+                robot_data = stack_windows(fit, ROBOTS[ROBOT].joint_names)
+                robots = train_robot_stage(robot_data, humans, variants, options, progress, state)
+    finally:
+        torch.set_num_threads(threads)
+    interface = RobotInterface(ROBOT, ROBOTS[ROBOT].joint_names, ROBOTS[ROBOT].end_effector)
+    return [
+        Checkpoint(
+            path=out,
+            name=out.name,
+            dataset=source.name,
+            dataset_checksum=source.checksum,
+            human_vae=human.vae,
+            hmms=human.hmms,
+            robot_vaes=robots[index] if stage == "hri" else {},
+            robot=interface if stage == "hri" else None,
+            hidden=options.hidden,
+        )
+        for index, human in enumerate(humans)
+    ], held
+
+
+def _readme(checkpoint: Checkpoint, source: Dataset, scores: Sequence[dict[str, float]], best: int) -> str:
+    """What a person reads in the checkpoint's folder."""
+    lines = [
+        f"# {checkpoint.name}",
+        "",
+        f"Trained on {source.title}, by:",
+        "",
+        f"    {checkpoint.training['command']}",
+        "",
+        f"Dataset `{source.name}`, SHA-256 `{source.checksum}`. {checkpoint.training['fitted_trials']} trials fitted; "
+        f"the best of {len(scores) or 1} seeds was chosen on {len(checkpoint.training['held_out_trials'])} held-out "
+        "training trials. Test split, read once after that:",
+        "",
+        f"    mild-viz evaluate --checkpoint checkpoints/{checkpoint.name} --dataset {source.name}",
+        "",
+        "| model | " + " | ".join(checkpoint.actions) + " | mean |",
+        "|---|" + "---|" * (len(checkpoint.actions) + 1),
+    ]
+    rows = checkpoint.metrics["test"]
+    for model in dict.fromkeys(row["model"] for row in rows):
+        values = [row["mse_mean"] for row in rows if row["model"] == model]
+        lines.append(f"| {model} | " + " | ".join(f"{value:.4f}" for value in [*values, float(np.mean(values))]) + " |")
+    if scores:
+        lines += ["", "Held-out error of every seed (mean over actions; chosen: " + str(best) + "):", ""]
+        lines += [f"- seed {i}: " + ", ".join(f"{k} {v:.4f}" for k, v in s.items()) for i, s in enumerate(scores)]
+    return "\n".join(lines) + "\n"
