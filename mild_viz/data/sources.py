@@ -66,9 +66,10 @@ SOURCES: dict[str, Source] = {
         (DataFile(Path("handover/train.npz")), DataFile(Path("handover/test.npz"))),
         by_hand=(
             "Its source, the GitHub repository hyeonseong-kim98/dynamic_handover_dataset, publishes one Python pickle "
-            "a motion, which mild_viz does not open; nobody publishes the two .npz files, so there is neither an address "
-            "nor a checksum to trust. Convert the motions yourself, into arrays receiver and giver (N, 34, 3) [m] in "
-            "ZED body-34 order, offsets (first frame of each trial, then N) and rate_hz, and place them at"
+            "a motion, which mild_viz does not open; no place is known that publishes the two .npz files, so there is "
+            "neither an address nor a checksum to trust. Convert the motions yourself, into arrays receiver and giver "
+            "(N, 34, 3) [m] in ZED body-34 order, offsets (first frame of each trial, then N) and rate_hz, and place "
+            "them at"
         ),
     ),
 }
