@@ -17,7 +17,7 @@ DEAD_STATE_STEPS = 2.0
 """A state that explains fewer steps than this has died and is placed anew."""
 
 
-def equal_segments(sequences: Sequence[Float[np.ndarray, "T D"]], n_states: int, floor: float) -> HMM:
+def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int, floor: float) -> HMM:
     """The paper's start: every sequence cut into `n_states` equal parts in time, one state a part (Sec. V-A)."""
     size = sequences[0].shape[1]
     parts = [[] for _ in range(n_states)]
@@ -41,7 +41,12 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "T D"]], n_states: int,
     )
 
 
-def em_step(hmm: HMM, sequences: Sequence[Float[np.ndarray, "T D"]], floor: float) -> tuple[HMM, float]:
+def em_step(
+    hmm: HMM,
+    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    floor: float,
+    transition_floor: float = TRANSITION_FLOOR,
+) -> tuple[HMM, float]:
     """One iteration of EM. Returns the new model and the log-likelihood of the one that was given.
 
     `floor` is added to the diagonal of every covariance (the paper's regularisation), once an iteration.
@@ -86,14 +91,14 @@ def em_step(hmm: HMM, sequences: Sequence[Float[np.ndarray, "T D"]], floor: floa
     covariances += floor * np.eye(size)
     transition = np.maximum(counts, 0.0) / np.maximum(counts.sum(1, keepdims=True), 1e-300)
     transition = np.where(counts.sum(1, keepdims=True) > 0, transition, hmm.transition_matrix)
-    transition = np.maximum(transition, TRANSITION_FLOOR)
-    initial = np.maximum(initial / len(sequences), TRANSITION_FLOOR)
+    transition = np.maximum(transition, transition_floor)
+    initial = np.maximum(initial / len(sequences), transition_floor)
     new = HMM(initial / initial.sum(), transition / transition.sum(1, keepdims=True), means, covariances)
     return new, total
 
 
 def fit(
-    hmm: HMM, sequences: Sequence[Float[np.ndarray, "T D"]], floor: float, n_iterations: int, tolerance: float = 1e-3
+    hmm: HMM, sequences: Sequence[Float[np.ndarray, "_ D"]], floor: float, n_iterations: int, tolerance: float = 1e-3
 ) -> tuple[HMM, list[float]]:
     """EM from a start until the log-likelihood per step rises by less than `tolerance`, or `n_iterations`.
 

@@ -26,9 +26,10 @@ class RunState:
             before = json.loads(file.read_text())
             changed = [key for key in record if before.get(key) != record[key]]
             if changed:
+                was, asked = [before.get(key) for key in changed], [record[key] for key in changed]
                 raise UserError(
-                    f"{file}: the run to resume differs in {', '.join(changed)}: it was {[before.get(k) for k in changed]}, "
-                    f"asked for is {[record[k] for k in changed]}; give the same options, or start anew without --resume"
+                    f"{file}: the run to resume differs in {', '.join(changed)}: it was {was}, asked for is {asked}; "
+                    "give the same options, or start anew without --resume"
                 )
             return
         if resume:
