@@ -50,9 +50,10 @@ def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the human stands seen from the robot: the human frame's origin in the robot's base frame [m].
+    """Where the human stands seen from the robot: the human frame's origin from the robot's shoulder [m].
 
-    The human faces the robot (yaw of pi about z). `source` says in words where the numbers come from.
+    The shoulder is the first controlled joint, so that descriptions with another base give the same place.
+    The human faces the robot (yaw of pi about z) unless the recording says otherwise. `source` says in words where the numbers come from.
     """
 
     distance: float

@@ -29,6 +29,8 @@ class RobotModel:
     name: str
     chain: ArmChain
     tree: LinkTree
+    rest: dict[str, float]
+    """Where the joints rest [rad]; those not named at 0."""
     description: Description
 
     @property
@@ -50,6 +52,19 @@ class RobotModel:
         """One coloured mesh per drawn link, in the link's frame [m]; read at the first use."""
         return load_visuals(self.description)
 
+    @cached_property
+    def floor(self) -> float:
+        """Height of the floor that the resting robot stands on, in the base frame [m]."""
+        footprint = [joint.child for joint in self.description.joints if joint.child == "base_footprint"]
+        if footprint:
+            values = self.description.values(self.rest)
+            pose = np.eye(4)
+            for joint in self.description.path_to(footprint[0]):
+                pose = pose @ joint.motion(values[joint.name])
+            return float(pose[2, 3])
+        poses = dict(zip(self.link_names, self.tree.resting, strict=True))
+        return min((_lowest(mesh, poses[name]) for name, mesh in self.visuals.items()), default=0.0)
+
     def link_poses(self, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N L 7"]:
         """Pose of every drawn link in the base frame (wxyz, xyz [m]) at N joint vectors [rad]."""
         self._check(joints)
@@ -66,6 +81,13 @@ class RobotModel:
             raise UserError(f"joints have the shape {joints.shape}; expected a row of {expected} per frame")
 
 
+def _lowest(mesh: trimesh.Trimesh, pose: Float[np.ndarray, "7"]) -> float:
+    """Smallest z of a mesh in a pose (wxyz, xyz)."""
+    w, x, y, z = pose[:4]
+    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+    return float(pose[6] + np.min(mesh.vertices @ up))
+
+
 def load_robot(
     name_or_path: str, joint_names: tuple[str, ...] | None = None, end_effector: str | None = None
 ) -> RobotModel:
@@ -80,4 +102,4 @@ def load_robot(
     description = read_description(path)
     chain = load_chain(description, joint_names, end_effector or known.end_effector, known.rest)
     tree = build_tree(description, joint_names, known.rest, drawn_links(description))
-    return RobotModel(name, chain, tree, description)
+    return RobotModel(name, chain, tree, known.rest, description)
