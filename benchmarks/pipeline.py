@@ -93,7 +93,8 @@ def main(
         return np.diff(times)[NEWEST : NEWEST + n]
 
     n, target, contact = inference.n_windows, rollout.target, rollout.contact
-    full(), control_only(), stream_frames()  # compile
+    for job in (full, control_only, stream_frames):
+        job()  # compile
     naive_times, stream_times, full_times, control_times = [], [], [], []
     for _ in range(rounds):
         naive_times.append(naive_frames())

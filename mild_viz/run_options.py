@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import tyro
 
 from mild_viz import paths
-from mild_viz.errors import UserError
 
 if TYPE_CHECKING:
     from mild_viz.rollout import Rollout
@@ -88,25 +87,17 @@ class RunOptions:
         from mild_viz.robot.model import load_robot
         from mild_viz.settings import ControlSettings, Placement
 
-        checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
+        checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
         interface = checkpoint.for_robot()
-        inference = infer(checkpoint, trial, self.variant)
-        if self.contact_states is None:
-            contact_states = checkpoint.contact_states.get(trial.action, frozenset())
-        else:
-            contact_states = frozenset(self.contact_states)
-            wrong = sorted(state for state in contact_states if not 0 <= state < inference.n_states)
-            if wrong:
-                raise UserError(f"--contact-states: {wrong} do not exist; valid: 0 to {inference.n_states - 1}")
         settings = ControlSettings(
             controller=self.controller,
             lambda_x=self.lambda_x,
             lambda_q=self.lambda_q,
-            contact_states=contact_states,
+            contact_states=None if self.contact_states is None else frozenset(self.contact_states),
             stiffness=self.stiffness,
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
         robot = load_robot(self.robot, interface.joint_names, interface.end_effector)
-        return control(inference, checkpoint, robot, trial, settings)
+        return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings)

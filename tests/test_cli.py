@@ -72,7 +72,7 @@ def test_choices_are_those_of_the_tables() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ("rollout --dataset nothing --out {tmp}/a.npz", "no model ships for dataset 'nothing'"),
+        ("rollout --dataset nothing --out {tmp}/a.npz", "'nothing' is unknown; valid: demo"),
         ("rollout --checkpoint {tmp}/none --out {tmp}/a.npz", "is not a checkpoint"),
         ("rollout --out {tmp}/a.txt", "must end in .npz"),
         ("rollout --out {tmp}/none/a.npz", "there is no folder"),
