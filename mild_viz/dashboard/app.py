@@ -1,0 +1,186 @@
+"""The page, put together: server, scene, controls, timeline, session and player."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import webbrowser
+from pathlib import Path
+
+import viser
+from rich.console import Console
+
+from mild_viz import paths, pipeline
+from mild_viz.checkpoint import Checkpoint, load_checkpoint
+from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.controls import Controls
+from mild_viz.dashboard.player import Player
+from mild_viz.dashboard.scene.scene import Scene
+from mild_viz.dashboard.server import check_port, is_loopback, open_server
+from mild_viz.dashboard.session import Choice, Pipeline, Session
+from mild_viz.dashboard.timeline import Timeline
+from mild_viz.data.load import load_dataset
+from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.rollout import Rollout
+from mild_viz.settings import ControlSettings, InferSettings, choose
+from mild_viz.trial import Dataset, Trial
+
+LABEL = "mild_viz"
+
+
+class Dashboard:
+    """A running page. `stop` ends it."""
+
+    def __init__(self, host: str, port: int, catalog: Catalog, robot: RobotModel, first: InferSettings) -> None:
+        self.server = open_server(host, port, LABEL)
+        self.url = f"http://{host}:{port}"
+        self.robot = robot
+        self._dark: bool | None = None
+        self._set_theme(False)
+        self.scene = Scene(self.server, robot, dark=False)
+        self.player = Player(self.scene.set_frame, self._tick, lambda: bool(self.server.get_clients()))
+        self.controls = Controls(
+            self.server, catalog, first, lambda: self.session.mark_dirty(), self.scene.move_camera,
+            self._write_html, self._write_csv,
+        )  # fmt: skip
+        self.timeline = Timeline(self.server, self.player)
+        stages = Pipeline(pipeline.infer, self._control)
+        self.session = Session(self.controls.read, stages, self._show, self.controls.report)
+        self.server.on_client_connect(self._welcome)
+        self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
+        self.session.start()
+
+    def stop(self) -> None:
+        """End playback, worker and server."""
+        self._playing.cancel()
+        self.session.close()
+        self.server.stop()
+
+    def _control(self, inference, checkpoint: Checkpoint, trial: Trial, settings: ControlSettings) -> Rollout:
+        return pipeline.control(inference, checkpoint, self.robot, trial, settings)
+
+    def _show(self, rollout: Rollout, choice: Choice, is_new: bool) -> None:
+        """Called by the session's worker with every new rollout or view."""
+        self._set_theme(choice.view.dark)
+        self.scene.show(rollout, choice.view)
+        trial = choice.settings.infer
+        restart = is_new and (self.session.choice is None or self.session.choice.settings.infer.trial != trial.trial)
+        self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
+        self.controls.show(rollout, choice)
+        self.timeline.show(rollout, choice.view.alpha_mode)
+        self._tick(self.player.frame, self.player.playing)
+        if self.session.choice is None:
+            # Reading all datasets may take seconds: the page stands already, and the list completes itself.
+            threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()
+
+    def _tick(self, frame: int, playing: bool) -> None:
+        self.timeline.tick(frame, playing)
+        self.controls.tick(frame)
+
+    def _set_theme(self, dark: bool) -> None:
+        if dark != self._dark:
+            self._dark = dark
+            self.server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        """Fit the camera to a new browser's canvas, which takes its final shape when the panels have docked."""
+        aspect = 0.0
+        for _ in range(6):
+            await asyncio.sleep(0.25)
+            with contextlib.suppress(Exception):  # the browser may be gone again
+                now = client.camera.image_width / max(client.camera.image_height, 1)
+                if self.scene.layout is not None and abs(now - aspect) > 0.01 * now:
+                    self.scene.move_camera(client, "both")
+                    aspect = now
+
+    def _write_html(self, path: Path) -> None:
+        from mild_viz.dashboard import recorder  # only a recording needs it
+
+        assert self.session.rollout is not None and self.session.choice is not None
+        recorder.record_html(self.session.rollout, self.robot, self.session.choice.view, path)
+
+    def _write_csv(self, path: Path) -> None:
+        from mild_viz.dashboard import recorder
+
+        assert self.session.rollout is not None
+        recorder.record_csv(self.session.rollout, path)
+
+
+def first_settings(
+    dataset: Dataset, checkpoint: Checkpoint, action: str | None, trial: int, variant: str | None
+) -> InferSettings:
+    """What is shown first: the `trial`-th test trial of an action that both dataset and model know."""
+    shared = tuple(name for name in dataset.actions if name in checkpoint.actions)
+    if not shared:
+        raise UserError(
+            f"checkpoint {checkpoint.name} knows {', '.join(checkpoint.actions)}; "
+            f"dataset '{dataset.name}' holds {', '.join(dataset.actions)}"
+        )
+    action = choose(f"{dataset.name}: action", action or preferred(shared), shared)
+    trials = [one for one in dataset.test + dataset.train if one.action == action]
+    if not 0 <= trial < len(trials):
+        raise UserError(f"{dataset.name} has no {action} trial {trial}; valid: 0 to {len(trials) - 1}")
+    fallback = "v3.1" if "v3.1" in checkpoint.variants else checkpoint.variants[0]
+    variant = choose(f"checkpoint {checkpoint.name}: variant", variant or fallback, checkpoint.variants)
+    return InferSettings(dataset.name, trials[trial].split, trials[trial].index, variant)
+
+
+def preferred(actions: tuple[str, ...]) -> str:
+    """The action that shows most: a handshake, if there is one."""
+    return "handshake" if "handshake" in actions else actions[0]
+
+
+def open_dashboard(
+    checkpoint: Path | None = None,
+    dataset: str = "demo",
+    action: str | None = None,
+    trial: int = 0,
+    variant: str | None = None,
+    robot: str = "pepper",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> Dashboard:
+    """Load model, data and robot, and start the page. Returns while the first rollout is computed.
+
+    Raises:
+        UserError: for anything that was given and cannot be used, before a server is started.
+    """
+    check_port(host, port)
+    recordings = load_dataset(dataset)
+    folder = checkpoint or paths.default_checkpoint(dataset)
+    model = load_checkpoint(folder)
+    interface = model.for_robot()
+    arm = load_robot(robot, interface.joint_names, interface.end_effector)
+    catalog = Catalog(arm, folder)
+    first = first_settings(recordings, model, action, trial, variant)
+    problem = catalog.problem(catalog.name_of(folder), dataset)
+    if problem is not None:
+        raise UserError(problem)
+    return Dashboard(host, port, catalog, arm, first)
+
+
+def run(
+    checkpoint: Path | None = None,
+    dataset: str = "demo",
+    action: str | None = None,
+    trial: int = 0,
+    variant: str | None = None,
+    robot: str = "pepper",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> None:
+    """Start the page and serve it until Ctrl-C."""
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, host, port)
+    console = Console()
+    console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
+    if not is_loopback(host):
+        console.print("[yellow]Everybody who reaches this address can use the page: it has no password.[/yellow]")
+    if open_browser:
+        webbrowser.open(dashboard.url)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        dashboard.stop()

@@ -1,0 +1,132 @@
+"""What the page can offer: the datasets that are here, the models that fit them, and their trials."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+from mild_viz import paths
+from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
+from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
+from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel
+from mild_viz.trial import Dataset, Trial
+
+
+class Catalog:
+    """Datasets and models by name. Each is read when it is first asked for, and then kept."""
+
+    def __init__(self, robot: RobotModel, chosen: Path | None = None) -> None:
+        self._robot = robot
+        self._checkpoints: dict[Path, Checkpoint] = {}
+        self._problems: dict[tuple[str, str], str | None] = {}
+        self.chosen = None if chosen is None else chosen.resolve()
+
+    @cached_property
+    def model_paths(self) -> dict[str, Path]:
+        """Folder of each model by its name on the page: those that ship, and the one that was asked for."""
+        try:
+            shipped = sorted(path.parent for path in paths.checkpoints().glob(f"*/{CONFIG}"))
+        except UserError:
+            shipped = []
+        found = {path.name: path.resolve() for path in shipped}
+        if self.chosen is not None and self.chosen not in found.values():
+            name = self.chosen.name if self.chosen.name not in found else str(self.chosen)
+            found = {name: self.chosen, **found}
+        return found
+
+    def name_of(self, path: Path) -> str:
+        """The name on the page of the model in a folder."""
+        return next(name for name, folder in self.model_paths.items() if folder == path.resolve())
+
+    def present(self) -> tuple[str, ...]:
+        """The datasets whose files are here."""
+        root = data_root()
+        return tuple(name for name in DATASETS if not missing_files(name, root))
+
+    def absent(self) -> tuple[str, ...]:
+        """The datasets that would have to be fetched first."""
+        present = self.present()
+        return tuple(name for name in DATASETS if name not in present)
+
+    def dataset(self, name: str) -> Dataset:
+        return load_dataset(name)
+
+    def checkpoint(self, model: str) -> Checkpoint:
+        """The model of that name on the page."""
+        if model not in self.model_paths:
+            raise UserError(f"model '{model}' is unknown; valid: {', '.join(self.model_paths)}")
+        path = self.model_paths[model]
+        if path not in self._checkpoints:
+            self._checkpoints[path] = load_checkpoint(path)
+        return self._checkpoints[path]
+
+    def current(self, checkpoint: Checkpoint) -> Checkpoint:
+        """The latest state of a checkpoint, with the contact states saved since it was loaded."""
+        return self._checkpoints.get(checkpoint.path.resolve(), checkpoint)
+
+    def replace_checkpoint(self, checkpoint: Checkpoint) -> None:
+        """Use this one from now on: its default contact states were changed."""
+        self._checkpoints[checkpoint.path.resolve()] = checkpoint
+
+    def problem(self, model: str, dataset: str) -> str | None:
+        """Why a model cannot be used on a dataset with this robot; None if it can."""
+        key = (model, dataset)
+        if key not in self._problems:
+            self._problems[key] = self._find_problem(model, dataset)
+        return self._problems[key]
+
+    def _find_problem(self, model: str, dataset: str) -> str | None:
+        try:
+            checkpoint, recordings = self.checkpoint(model), self.dataset(dataset)
+            interface = checkpoint.for_robot()
+        except UserError as error:
+            return str(error)
+        joints = self._robot.chain.joint_names
+        if interface.joint_names != joints:
+            return (
+                f"model '{model}' drives the joints {', '.join(interface.joint_names)}; "
+                f"robot '{self._robot.name}' is controlled by {', '.join(joints)}"
+            )
+        if not set(checkpoint.actions) & set(recordings.actions):
+            return (
+                f"model '{model}' knows {', '.join(checkpoint.actions)}; "
+                f"dataset '{dataset}' holds {', '.join(recordings.actions)}"
+            )
+        recorded = next((t for t in recordings.train + recordings.test if t.robot_joints is not None), None)
+        if recorded is not None and recorded.robot_joint_names != interface.joint_names:
+            return (
+                f"dataset '{dataset}' recorded the joints {', '.join(recorded.robot_joint_names)}, "
+                f"model '{model}' drives {', '.join(interface.joint_names)}"
+            )
+        return None
+
+    def models(self, dataset: str) -> tuple[str, ...]:
+        """The models that can be used on a dataset, the best first: asked for, made for it, others."""
+        fitting = [model for model in self.model_paths if self.problem(model, dataset) is None]
+        return tuple(sorted(fitting, key=lambda model: self._rank(model, dataset)))
+
+    def _rank(self, model: str, dataset: str) -> tuple[int, str]:
+        if self.model_paths[model] == self.chosen:
+            return 0, model
+        if paths.SHIPPED_MODELS.get(dataset) == model:
+            return 1, model
+        return (2 if self.checkpoint(model).dataset == dataset else 3), model
+
+    def usable_datasets(self) -> tuple[str, ...]:
+        """The datasets that are here and that some model fits."""
+        return tuple(name for name in self.present() if self.models(name))
+
+    def actions(self, model: str, dataset: str) -> tuple[str, ...]:
+        """The interactions that both know."""
+        known = self.checkpoint(model).actions
+        return tuple(action for action in self.dataset(dataset).actions if action in known)
+
+    def trials(self, dataset: str, action: str) -> dict[str, Trial]:
+        """The trials of an action by their names on the page, those of the test set first."""
+        recordings = self.dataset(dataset)
+        return {
+            f"{trial.split} {trial.index}": trial
+            for trial in recordings.test + recordings.train
+            if trial.action == action
+        }

@@ -1,0 +1,139 @@
+"""The control panel: a header that says what is shown, the message of a failed rerun, and the tabs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+
+import numpy as np
+import viser
+
+from mild_viz.checkpoint import save_contact_states
+from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.charts import state_color
+from mild_viz.dashboard.session import Choice
+from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
+from mild_viz.dashboard.tabs.record import RecordTab, Writer
+from mild_viz.dashboard.tabs.robot import RobotTab
+from mild_viz.dashboard.tabs.states import StatesTab
+from mild_viz.dashboard.tabs.trial import TrialTab
+from mild_viz.dashboard.tabs.view import ViewTab
+from mild_viz.dashboard.tabs.widgets import set_content
+from mild_viz.errors import UserError
+from mild_viz.rollout import Rollout
+from mild_viz.settings import InferSettings, Settings
+
+
+class Controls:
+    """Every widget of the panel. `read` turns them into a `Choice`; `show` follows the rollout."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        catalog: Catalog,
+        first: InferSettings,
+        changed: Callable[[], None],
+        move_camera: Callable[[viser.ClientHandle, str], None],
+        write_html: Writer,
+        write_csv: Writer,
+    ) -> None:
+        self._server, self._catalog = server, catalog
+        self._rollout: Rollout | None = None
+        self._choice: Choice | None = None
+        gui = server.gui
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_WIDTH)
+        gui.add_html(f"<style>{PANEL_CSS}</style>")
+        self._header = gui.add_html('<div class="mv-header">Loading …</div>')
+        self._now = gui.add_html("")
+        self._error = gui.add_html("", visible=False)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Trial"):
+            self._trial = TrialTab(gui, catalog, first, changed)
+        with tabs.add_tab("Robot"):
+            self._robot = RobotTab(gui, changed)
+        with tabs.add_tab("States"):
+            self._states = StatesTab(gui, changed)
+            self._states.save.on_click(self._save_contact_states)
+        with tabs.add_tab("View"):
+            self._view = ViewTab(gui, changed, move_camera)
+        with tabs.add_tab("Record"):
+            RecordTab(gui, lambda: self._rollout, write_html, write_csv)
+
+    def read(self) -> Choice:
+        """What the widgets say, checked. Raises UserError naming the widget."""
+        infer, checkpoint, trial = self._trial.read()
+        contact_states = self._states.read(checkpoint, trial.action)
+        control = self._robot.read(checkpoint, trial, contact_states)
+        return Choice(Settings(infer, control), self._view.read(), checkpoint, trial)
+
+    def show(self, rollout: Rollout, choice: Choice) -> None:
+        """Follow a new rollout."""
+        self._rollout, self._choice = rollout, choice
+        self._view.show(rollout)
+        self._trial.show(rollout)
+        self._robot.show(rollout)
+        self._states.show(rollout)
+        set_content(self._header, header_html(rollout, choice.checkpoint.name))
+
+    def offer_datasets(self) -> None:
+        """Complete the list of datasets, which takes reading them."""
+        self._trial.offer_datasets()
+
+    def tick(self, frame: int) -> None:
+        """Write what holds at the time cursor."""
+        if self._rollout is not None:
+            set_content(self._now, now_html(self._rollout, min(frame, self._rollout.inference.n_windows - 1)))
+
+    def report(self, message: str | None) -> None:
+        """Show the message of a failed rerun until the next that succeeds."""
+        if message is None:
+            self._error.visible = False
+            return
+        set_content(
+            self._error,
+            f'<div class="mv-error" role="alert"><b>This could not be done.</b> {escape(message)} '
+            "The last good result is still shown.</div>",
+        )
+        self._error.visible = True
+        for client in self._server.get_clients().values():
+            client.add_notification("This could not be done", message, color="red", auto_close_seconds=8.0)
+
+    def _save_contact_states(self, event: viser.GuiEvent) -> None:
+        choice = self._choice
+        if choice is None or event.client_id is None:
+            return
+        states = choice.settings.control.contact_states or frozenset()
+        action = choice.trial.action
+        try:
+            # What was read last, not what a click in flight may still change: it is what the page shows.
+            current = self._catalog.current(choice.checkpoint)
+            self._catalog.replace_checkpoint(save_contact_states(current, action, states))
+        except UserError as error:
+            self._states.say_saved(f"Not saved: {error}")
+            return
+        names = ", ".join(str(state + 1) for state in sorted(states)) or "none"
+        self._states.say_saved(f"Saved: {names} for {action}, the default of {choice.checkpoint.name} from now on.")
+
+
+def header_html(rollout: Rollout, model: str) -> str:
+    """What is shown, in two lines."""
+    inference = rollout.inference
+    errors = inference.window_error[np.isfinite(inference.window_error)]
+    mse = f"{errors.mean():.4f} rad²" if len(errors) else "unknown (no true motion)"
+    return (
+        f'<div class="mv-header"><b>{escape(inference.dataset)} · {escape(inference.action)} · '
+        f"{escape(inference.split)} {inference.trial}</b><br>"
+        f"{escape(inference.variant)} of {escape(model)}, controlled by {escape(rollout.controller)}<br>"
+        f"MSE of this trial <b>{mse}</b></div>"
+    )
+
+
+def now_html(rollout: Rollout, frame: int) -> str:
+    """State and distance at the cursor."""
+    state = int(rollout.inference.active_state[frame])
+    phase = "contact" if rollout.contact[frame] else "no contact"
+    return (
+        f'<div class="mv-header mv-live"><span class="mv-swatch" style="background:{state_color(state)}"></span>'
+        f"State <b>{state + 1}</b> · {phase} · hands <b>{100 * rollout.hand_distance[frame]:.1f} cm</b> apart</div>"
+    )

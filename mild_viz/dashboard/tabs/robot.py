@@ -1,0 +1,114 @@
+"""What the robot does with the model's prediction: controller, IK weights, smoothing, stiffness, placement."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+import viser
+
+from mild_viz.checkpoint import Checkpoint
+from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, set_content
+from mild_viz.rollout import Rollout
+from mild_viz.settings import CONTROLLERS, ControlSettings, Placement
+from mild_viz.trial import Trial
+
+WEIGHT_EXPONENTS = (-4.0, 2.0)
+"""Range of the IK weights, as powers of ten."""
+MARKS = ((-4.0, "0.0001"), (-2.0, "0.01"), (0.0, "1"), (2.0, "100"))
+REACH = 0.5
+"""How far a person may move the human from where the recording or the model puts them [m]."""
+
+
+class RobotTab:
+    """Widgets of `ControlSettings`, but for the contact states."""
+
+    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
+        default = ControlSettings()
+        self._controller = gui.add_dropdown(
+            "Controller", CONTROLLERS, initial_value=default.controller,
+            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states.",
+        )  # fmt: skip
+        self._lambda_x = self._weight(gui, "λx", default.lambda_x, "Weight of reaching the hand (power of ten).")
+        self._lambda_q = self._weight(gui, "λq", default.lambda_q, "Weight of staying at the decoded joints.")
+        self._smoothing = gui.add_slider(
+            "Smoothing", 0.05, 1.0, 0.05, default.smoothing,
+            hint="Share of the new command in the moving average; 1 switches smoothing off.",
+        )  # fmt: skip
+        self._stiffness = gui.add_checkbox(
+            "Soft in contact", default.stiffness, hint="Lower the joints' stiffness in the contact of a handshake."
+        )
+        with gui.add_folder("Placement of the human"):
+            self._source = gui.add_html("")
+            self._place = {
+                axis: gui.add_slider(label, -2.0, 2.0, 0.01, 0.0, marks=(), hint=hint)
+                for axis, label, hint in (
+                    ("distance", "Distance", "How far in front of the robot's shoulder the human's collar is [m]."),
+                    ("lateral", "Lateral", "How far to the robot's left, from its shoulder [m]."),
+                    ("height", "Height", "Of the human's collar over the robot's shoulder [m]."),
+                )
+            }
+            self._reset = gui.add_button("Reset placement", icon=viser.Icon.RESTORE, hint="Back to where it came from.")
+        self._placed: dict[str, float] = {}
+        self._chosen: Placement | None = None
+        self._to_reset = False
+        self._of: tuple[object, ...] = ()
+        widgets = (self._controller, self._lambda_x, self._lambda_q, self._smoothing, self._stiffness)
+        for handle in (*widgets, *self._place.values()):
+            on_person(handle, changed)
+
+        @self._reset.on_click
+        def _(_event: viser.GuiEvent) -> None:
+            self._to_reset = True
+            changed()
+
+    @staticmethod
+    def _weight(gui: viser.GuiApi, name: str, value: float, hint: str) -> viser.GuiSliderHandle[float]:
+        slider = gui.add_slider(
+            f"{name} = {value:g}", *WEIGHT_EXPONENTS, 0.05, float(np.log10(value)), marks=MARKS, hint=hint
+        )
+        return slider
+
+    def read(self, checkpoint: Checkpoint, trial: Trial, contact_states: frozenset[int]) -> ControlSettings:
+        """The chosen settings. The placement is the trial's own until a person moves it."""
+        weights = {}
+        for name, slider in (("λx", self._lambda_x), ("λq", self._lambda_q)):
+            weights[name] = float(f"{10.0 ** number(slider):.3g}")
+            label = f"{name} = {weights[name]:g}"
+            if slider.label != label:
+                slider.label = label
+        return ControlSettings(
+            controller=option(self._controller),
+            lambda_x=weights["λx"],
+            lambda_q=weights["λq"],
+            contact_states=contact_states,
+            stiffness=bool(self._stiffness.value),
+            smoothing=number(self._smoothing),
+            placement=self._placement(checkpoint, trial),
+        )
+
+    def _placement(self, checkpoint: Checkpoint, trial: Trial) -> Placement | None:
+        # A recording with one world frame has its own placement per trial; else it is the model's for all.
+        of = (checkpoint.human_vae, trial.name if trial.T_world_human is not None else trial.dataset)
+        if of != self._of or self._to_reset:
+            self._of, self._to_reset, self._chosen, self._placed = of, False, None, {}
+        values = {axis: number(slider) for axis, slider in self._place.items()} if self._placed else {}
+        if values != self._placed:
+            self._chosen = Placement(**values, source="chosen on this page")
+        return self._chosen
+
+    def show(self, rollout: Rollout) -> None:
+        """Put the sliders where the human stands, and say where that comes from."""
+        if self._chosen is None:
+            for axis, slider in self._place.items():
+                value = round(getattr(rollout.placement, axis), 2)
+                slider.min, slider.max = round(value - REACH, 2), round(value + REACH, 2)
+                slider.value = value
+        self._placed = {axis: float(slider.value) for axis, slider in self._place.items()}
+        self._reset.disabled = self._chosen is None
+        set_content(self._source, f'<div class="mv-note">{escape(sentence(rollout.placement.source))}</div>')
+
+
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""

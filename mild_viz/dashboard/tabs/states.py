@@ -1,0 +1,84 @@
+"""Which HMM states are contact: one coloured checkbox per state, and saving the choice into the checkpoint."""
+
+from __future__ import annotations
+
+from html import escape
+
+import viser
+
+from mild_viz.checkpoint import Checkpoint
+from mild_viz.dashboard.charts import state_color
+from mild_viz.dashboard.tabs.widgets import Changed, on_person, set_content, widget_id
+from mild_viz.rollout import Rollout
+
+BOX_CSS = """
+.mantine-Flex-root:has(> div > p > label[for="ID"]) { flex-direction: row-reverse; justify-content: flex-end; }
+.mantine-Flex-root:has(> div > p > label[for="ID"]) > div:first-child {
+  width: auto !important; flex: 1; padding-left: 8px;
+}
+.mantine-Flex-root:has(> div > p > label[for="ID"]) > div:last-child { flex-grow: 0 !important; }
+label[for="ID"] { color: var(--mantine-color-text); letter-spacing: -0.2px; cursor: pointer; }
+input[id="ID"] { border: 2px solid COLOR; background-color: COLOR44; }
+input[id="ID"]:checked { background-color: COLOR; border-color: COLOR; }
+"""
+
+
+class StatesTab:
+    """Checkboxes of the contact states of the action that is shown."""
+
+    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
+        self._gui, self._changed = gui, changed
+        self._intro = gui.add_html("")
+        self._folder = gui.add_folder(None)
+        self._boxes: list[viser.GuiCheckboxHandle] = []
+        self._of: tuple[object, ...] = ()
+        self.save = gui.add_button(
+            "Save contact states", icon=viser.Icon.DEVICE_FLOPPY,
+            hint="Make these the model's default for this action, here and in the mild-viz commands.",
+        )  # fmt: skip
+        self._saved = gui.add_html("")
+
+    def _build(self, n_states: int) -> None:
+        with self._folder:
+            for state in range(len(self._boxes), n_states):
+                box = self._gui.add_checkbox(
+                    f"State {state + 1}", False, hint="Ticked: the partners touch in this state, and mild-ik adapts."
+                )
+                css = BOX_CSS.replace("ID", widget_id(box)).replace("COLOR", state_color(state))
+                self._gui.add_html(f"<style>{css}</style>")
+                on_person(box, self._changed)
+                self._boxes.append(box)
+        for state, box in enumerate(self._boxes):
+            box.visible = state < n_states
+
+    def read(self, checkpoint: Checkpoint, action: str) -> frozenset[int]:
+        """The ticked states. Another model or action brings its own default."""
+        if len(self._boxes) < checkpoint.n_states or self._of[:1] != (checkpoint.human_vae,):
+            self._build(checkpoint.n_states)
+        if self._of != (checkpoint.human_vae, action):
+            self._of = (checkpoint.human_vae, action)
+            self.tick(checkpoint.contact_states.get(action, frozenset()))
+            set_content(self._saved, "")
+        return frozenset(state for state in range(checkpoint.n_states) if self._boxes[state].value)
+
+    def tick(self, states: frozenset[int]) -> None:
+        for state, box in enumerate(self._boxes):
+            box.value = state in states
+
+    def say_saved(self, text: str) -> None:
+        set_content(self._saved, f'<div class="mv-note">{escape(text)}</div>')
+
+    def show(self, rollout: Rollout) -> None:
+        """Write how long and how often each state is active in this trial."""
+        set_content(
+            self._intro,
+            '<div class="mv-note">States in which the partners touch during '
+            f"<b>{escape(rollout.inference.action)}</b>: there the robot goes for the human's hand. "
+            "Mean visit and share of this trial:</div>",
+        )
+        for state in range(rollout.inference.n_states):
+            length, share = rollout.state_durations[state], rollout.state_occupancy[state]
+            times = f"{length:.2f} s, {100 * share:.0f} %" if share > 0 else "not visited"
+            label = f"State {state + 1}: {times}"
+            if self._boxes[state].label != label:
+                self._boxes[state].label = label

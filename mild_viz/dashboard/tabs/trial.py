@@ -1,0 +1,100 @@
+"""What is looked at: dataset, model, action, trial, variant. A change here reruns everything."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+import viser
+
+from mild_viz.checkpoint import Checkpoint
+from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.tabs.widgets import Changed, offer, on_person, option, set_content
+from mild_viz.errors import UserError
+from mild_viz.rollout import Rollout
+from mild_viz.settings import VARIANTS, InferSettings
+from mild_viz.trial import Trial
+
+
+class TrialTab:
+    """Dropdowns of which each offers what the ones above it leave."""
+
+    def __init__(self, gui: viser.GuiApi, catalog: Catalog, first: InferSettings, changed: Changed) -> None:
+        self._catalog = catalog
+        trial = catalog.dataset(first.dataset).trial(first.split, first.trial)
+        self._last = (first.dataset, trial.action)
+        models = catalog.models(first.dataset)
+        checkpoint = catalog.checkpoint(models[0])
+        self._dataset = gui.add_dropdown(
+            "Dataset", (first.dataset,), hint="Recordings that are on this machine and that a model fits."
+        )
+        self._model = gui.add_dropdown("Model", models, hint="Trained models (checkpoints) for this dataset and robot.")
+        self._action = gui.add_dropdown(
+            "Action", catalog.actions(models[0], first.dataset), initial_value=trial.action,
+            hint="Kind of interaction; each has its own hidden Markov model.",
+        )  # fmt: skip
+        self._trial = gui.add_dropdown(
+            "Trial", tuple(catalog.trials(first.dataset, trial.action)), initial_value=f"{trial.split} {trial.index}",
+            hint="One recording. The model never saw those of the test set in training.",
+        )  # fmt: skip
+        self._variant = gui.add_dropdown(
+            "Variant", checkpoint.variants, initial_value=first.variant,
+            hint="How the robot's decoder was trained and how it is conditioned on the human (the paper's table).",
+        )  # fmt: skip
+        self._note = gui.add_html("")
+        self._others = gui.add_html("")
+        for handle in (self._dataset, self._model, self._action, self._trial, self._variant):
+            on_person(handle, changed)
+
+    def read(self) -> tuple[InferSettings, Checkpoint, Trial]:
+        """What is chosen, after offering what fits it. On a UserError the dataset is put back to the last good one."""
+        dataset = option(self._dataset)
+        new_dataset = dataset != self._last[0]
+        try:
+            models = self._catalog.models(dataset)
+            if not models:
+                problems = [str(self._catalog.problem(model, dataset)) for model in self._catalog.model_paths]
+                raise UserError(f"no model fits dataset '{dataset}': {'; '.join(problems) or 'there is none'}")
+        except UserError:
+            self._dataset.value = self._last[0]
+            raise
+        offer(self._model, models, models[0] if new_dataset else None)
+        model = option(self._model)
+        checkpoint = self._catalog.checkpoint(model)
+        offer(self._action, self._catalog.actions(model, dataset))
+        action = option(self._action)
+        trials = self._catalog.trials(dataset, action)
+        offer(self._trial, trials, next(iter(trials)) if (dataset, action) != self._last else None)
+        self._last = (dataset, action)
+        trial = trials[option(self._trial)]
+        offer(self._variant, checkpoint.variants)
+        settings = InferSettings(dataset, trial.split, trial.index, option(self._variant))
+        return settings, checkpoint, trial
+
+    def offer_datasets(self) -> None:
+        """List the datasets that can be used, and how to get the others. Reads them: call it when the page stands."""
+        usable = self._catalog.usable_datasets()
+        offer(self._dataset, usable if self._last[0] in usable else (self._last[0], *usable))
+        lines = [
+            f"{escape(name)}: <code>mild-viz data fetch {escape(name)}</code>" for name in self._catalog.absent()
+        ] + [
+            f"{escape(name)}: no model here fits; <code>mild-viz train --dataset {escape(name)}</code>"
+            for name in self._catalog.present()
+            if name not in usable
+        ]
+        if lines:
+            set_content(self._others, f'<div class="mv-note"><b>Not offered</b><br>{"<br>".join(lines)}</div>')
+
+    def show(self, rollout: Rollout) -> None:
+        """Say what the variant is and, where it uses the posterior's covariance, whether that can matter here."""
+        inference = rollout.inference
+        variant = VARIANTS[inference.variant]
+        text = escape(f"{variant.name}: {variant.summary}.")
+        if variant.posterior_covariance:
+            posterior, states = (
+                float(np.sqrt(np.nanmean(np.diagonal(covariance, axis1=1, axis2=2))))
+                for covariance in (inference.human_latent_covariance, inference.human_state_covariances)
+            )
+            effect = "so it changes almost nothing here" if posterior < 0.1 * states else "so it matters here"
+            text += f" The posterior's spread is {posterior:.2g}, that of the states {states:.2g}: {effect}."
+        set_content(self._note, f'<div class="mv-note">{text}</div>')

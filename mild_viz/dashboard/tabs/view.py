@@ -1,0 +1,88 @@
+"""How it is drawn: opacity, axes, ellipsoids, what is visible, camera, theme. Never reruns the pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import viser
+
+from mild_viz.dashboard.scene.scene import CAMERAS
+from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, option
+from mild_viz.dashboard.view import ViewSettings
+from mild_viz.rollout import Rollout
+from mild_viz.settings import ALPHA_MODES
+
+PCA, DIMENSIONS = "principal components", "dimensions"
+
+
+class ViewTab:
+    """Widgets of `ViewSettings`, and the camera presets."""
+
+    def __init__(
+        self, gui: viser.GuiApi, changed: Changed, move_camera: Callable[[viser.ClientHandle, str], None]
+    ) -> None:
+        default = ViewSettings()
+        names = {name.capitalize(): name for name in CAMERAS}
+        self._camera = gui.add_button_group("Camera", tuple(names), hint="Take this browser's camera to a preset.")
+        self._theme = gui.add_dropdown("Theme", ("light", "dark"), hint="Colours of the page, for all browsers.")
+        self._alpha = gui.add_dropdown(
+            "Opacity by α", ALPHA_MODES, initial_value=default.alpha_mode,
+            hint="Forward variable behind the opacity: of the human (as on a robot), of both, or of no observation.",
+        )  # fmt: skip
+        self._sigma = gui.add_slider(
+            "Ellipsoid σ", 0.5, 3.0, 0.1, default.sigma, hint="Radius of the ellipsoids, in standard deviations."
+        )
+        self._axes = gui.add_dropdown(
+            "Latent axes", (PCA, DIMENSIONS), hint="What the three axes of the latent plot are."
+        )
+        self._dimensions = [
+            gui.add_dropdown(
+                f"Axis {axis}",
+                tuple("123"),
+                initial_value=str(i + 1),
+                visible=False,
+                hint=f"Latent dimension on the {axis} axis.",
+            )
+            for i, axis in enumerate("xyz")
+        ]
+        self._ghost = gui.add_checkbox(
+            "Ghost", default.ghost, hint="Also draw the decoded motion, before inverse kinematics, translucent."
+        )
+        self._visible = {
+            group: gui.add_checkbox(f"Show {group}", True, hint=f"Draw the {group}.")
+            for group in ("human", "robot", "latent plot")
+        }
+        widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost)
+        for handle in (*widgets, *self._visible.values()):
+            on_person(handle, changed)
+
+        @self._camera.on_click
+        def _(event: viser.GuiEvent) -> None:
+            name = names.get(self._camera.value)
+            if event.client is not None and name is not None:
+                move_camera(event.client, name)
+
+    def read(self) -> ViewSettings:
+        """The chosen view. Raises UserError where two axes show the same dimension."""
+        by_dimension = option(self._axes) == DIMENSIONS
+        for handle in self._dimensions:
+            if handle.visible != by_dimension:
+                handle.visible = by_dimension
+        x, y, z = (int(option(handle)) - 1 for handle in self._dimensions)
+        human, robot, latent = (bool(handle.value) for handle in self._visible.values())
+        return ViewSettings(
+            alpha_mode=option(self._alpha),
+            latent_axes=(x, y, z) if by_dimension else "pca",
+            sigma=number(self._sigma),
+            ghost=bool(self._ghost.value),
+            show_human=human,
+            show_robot=robot,
+            show_latent=latent,
+            dark=option(self._theme) == "dark",
+        )
+
+    def show(self, rollout: Rollout) -> None:
+        """Offer the latent dimensions that the model has."""
+        n_dimensions = rollout.inference.human_latent_mean.shape[1]
+        for handle in self._dimensions:
+            offer(handle, (str(i + 1) for i in range(n_dimensions)))
