@@ -15,7 +15,7 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
 from mild_viz.errors import UserError
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import forward_filter, log_emission, unobserved_forward
+from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.pairs import robot_truth
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
@@ -51,8 +51,12 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
     latent_truth, _ = robot_vae.encode(truth_windows)
 
     human_hmm = hmm.marginal(human)
-    log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean))
-    log_alpha_joint, _ = forward_filter(hmm, log_emission(hmm, np.concatenate([mean, latent_truth], axis=1)))
+    human_likelihood = log_emission(human_hmm, mean)
+    log_alpha, _ = forward_filter(human_hmm, human_likelihood)
+    both = np.concatenate([mean, latent_truth], axis=1)
+    # Where the partner was lost, the human alone still says something.
+    joint_likelihood = np.where(observed_rows(both)[:, None], log_emission(hmm, both), human_likelihood)
+    log_alpha_joint, _ = forward_filter(hmm, joint_likelihood)
     covariance_std = std if VARIANTS[variant].posterior_covariance else None
     robot_mean, robot_covariance = condition(hmm, mean, log_alpha, covariance_std)
     decoded = robot_vae.decode(robot_mean)
@@ -68,7 +72,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         rate=trial.rate,
         joint_names=interface.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
-        observed=~np.isnan(mean).any(1),
+        observed=observed_rows(mean),
         log_alpha_human=log_alpha,
         log_alpha_joint=log_alpha_joint,
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),

@@ -7,7 +7,7 @@ import pytest
 
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import HMM
-from tests.test_hmm import random_hmm
+from tests.models import random_hmm
 
 
 @pytest.fixture

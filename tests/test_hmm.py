@@ -20,16 +20,7 @@ from mild_viz.latent.hmm import (
     unobserved_forward,
     viterbi_path,
 )
-
-
-def random_hmm(rng: np.random.Generator, n_states: int, size: int) -> HMM:
-    roots = rng.normal(size=(n_states, size, size))
-    return HMM(
-        rng.dirichlet(np.ones(n_states)),
-        rng.dirichlet(np.ones(n_states), size=n_states),
-        rng.normal(size=(n_states, size)),
-        roots @ roots.transpose(0, 2, 1) + 0.3 * np.eye(size),
-    )
+from tests.models import random_hmm
 
 
 def path_log_probabilities(hmm: HMM, z: np.ndarray) -> dict[tuple[int, ...], float]:

@@ -13,6 +13,10 @@ from mild_viz.errors import UserError
 LEAK = 0.01
 """Negative slope of the leaky ReLU (Sec. V-A of the paper)."""
 
+LOG_STD_RANGE = (-12.0, 0.0)
+"""Bounds of the posterior's log standard deviation: latents have about unit scale, and an unbounded exponential
+of a rare input can swamp a whole training batch."""
+
 ENCODER = ("encoder.0", "encoder.1")
 DECODER = ("decoder.0", "decoder.1")
 LAYERS = (*ENCODER, "posterior_mean", "posterior_log_std", *DECODER, "output")
@@ -44,7 +48,7 @@ class VAE:
         for layer in ENCODER:
             x = self._affine(x, layer)
             x = np.maximum(x, LEAK * x)
-        return self._affine(x, "posterior_mean"), np.exp(self._affine(x, "posterior_log_std"))
+        return self._affine(x, "posterior_mean"), np.exp(np.clip(self._affine(x, "posterior_log_std"), *LOG_STD_RANGE))
 
     def decode(self, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N X"]:
         """Mean of p(x | z)."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mild_viz.latent.vae import DECODER, ENCODER, LAYERS, LEAK, VAE, layer_shapes
+from mild_viz.latent.vae import DECODER, ENCODER, LAYERS, LEAK, LOG_STD_RANGE, VAE, layer_shapes
 
 
 class BatchedVAE(nn.Module):
@@ -44,7 +44,7 @@ class BatchedVAE(nn.Module):
         """Mean and log standard deviation of q(z | x), both (M, B, D), of standardised input (M, B, X)."""
         for layer in ENCODER:
             x = nn.functional.leaky_relu(self._affine(x, layer), LEAK)
-        return self._affine(x, "posterior_mean"), self._affine(x, "posterior_log_std").clamp(-12.0, 0.0)
+        return self._affine(x, "posterior_mean"), self._affine(x, "posterior_log_std").clamp(*LOG_STD_RANGE)
 
     def decode(self, z: Tensor) -> Tensor:
         """Standardised mean (M, B, X) of p(x | z) for z (M, B, D)."""

@@ -1,0 +1,165 @@
+"""The checkpoint folder: what is written is read back; what is wrong is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from mild_viz.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, save_contact_states
+from mild_viz.errors import UserError
+from mild_viz.settings import Placement
+from tests.models import random_checkpoint
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "model"
+    save_checkpoint(replace(random_checkpoint(), placement=Placement(0.9, 0.1, 0.2, "test", True)), path, "# model\n")
+    return path
+
+
+def test_what_is_saved_is_loaded(folder: Path) -> None:
+    original, loaded = random_checkpoint(), load_checkpoint(folder)
+    assert loaded.variants == original.variants and loaded.actions == original.actions
+    assert loaded.placement == Placement(0.9, 0.1, 0.2, "test", True)
+    assert loaded.contact_states == original.contact_states
+    x = np.random.default_rng(0).normal(size=(3, 90))
+    np.testing.assert_array_equal(loaded.human_vae.encode(x)[0], original.human_vae.encode(x)[0])
+    for action in original.actions:
+        np.testing.assert_array_equal(
+            loaded.hmm(action).emission_covariances, original.hmm(action).emission_covariances
+        )
+
+
+def test_saving_again_replaces_the_whole_folder(folder: Path) -> None:
+    save_contact_states(load_checkpoint(folder), "wave", frozenset({1}))
+    save_checkpoint(random_checkpoint(1, ("v3.1",)), folder, "# new\n")
+    assert sorted(p.name for p in folder.iterdir()) == ["README.md", "config.json", "weights.safetensors"]
+    assert load_checkpoint(folder).variants == ("v3.1",)
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+def test_a_failing_write_leaves_the_old_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mild_viz.checkpoint.save_file", full)
+    with pytest.raises(OSError, match="No space"):
+        save_checkpoint(random_checkpoint(1), folder, "")
+    assert load_checkpoint(folder).name == "random"
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+def edit_config(folder: Path, **changes: Any) -> None:
+    file = folder / "config.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def edit_tensors(folder: Path, edit: Callable[[dict[str, np.ndarray]], None]) -> None:
+    tensors = load_file(folder / "weights.safetensors")
+    edit(tensors)
+    save_file(tensors, folder / "weights.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [("human/encoder.0.weight", (40, 91)), ("robot/v3.1/output.bias", (19,)), ("hmm/wave/emission_means", (5, 10))],
+)
+def test_a_wrong_shape_names_the_tensor(folder: Path, name: str, shape: tuple[int, ...]) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update({name: np.zeros(shape)}))
+    short = name.split("/")[-1]
+    with pytest.raises(UserError, match=rf"{short}' has shape .*, expected") as error:
+        load_checkpoint(folder)
+    assert str(shape) in str(error.value)
+
+
+def test_a_missing_tensor_is_named(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.__delitem__("human/output.bias"))
+    with pytest.raises(UserError, match=r"tensor 'output\.bias' is missing"):
+        load_checkpoint(folder)
+
+
+def test_values_that_are_not_finite_are_named(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update({"human/output.bias": np.full(90, np.nan)}))
+    with pytest.raises(UserError, match="not finite"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema_version": 99}, "schema_version is 99"),
+        ({"window": 8}, "window is 8 observations, this program works with 5"),
+        ({"actions": ["hug"]}, "action 'hug' is unknown; valid: wave"),
+        ({"variants": {"v9": {}}}, "variant 'v9' is unknown; valid: v1"),
+        ({"hidden": "wide"}, "malformed"),
+        ({"robot": {"name": "pepper"}}, "malformed"),
+        ({"robot": {"name": "yumi", "joint_names": list("abcdefg"), "end_effector": "x"}}, "shape"),
+    ],
+)
+def test_a_wrong_config_is_named(folder: Path, changes: dict[str, Any], message: str) -> None:
+    edit_config(folder, **changes)
+    with pytest.raises(UserError, match=message):
+        load_checkpoint(folder)
+
+
+def test_broken_files_are_named(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is not a checkpoint"):
+        load_checkpoint(tmp_path / "nothing")
+    weights = (folder / "weights.safetensors").read_bytes()
+    for cut in (b"", weights[: len(weights) // 2]):
+        (folder / "weights.safetensors").write_bytes(cut)
+        with pytest.raises(UserError, match=r"weights\.safetensors is not a readable"):
+            load_checkpoint(folder)
+    (folder / "config.json").write_text("{")
+    with pytest.raises(UserError, match=r"config\.json is not valid JSON"):
+        load_checkpoint(folder)
+
+
+def test_unknown_variant_and_action_list_the_valid_ones() -> None:
+    model = random_checkpoint(variants=("v1", "v3.1"))
+    with pytest.raises(UserError, match=r"'v3\.2' is unknown; valid: v1, v3\.1"):
+        model.robot_vae("v3.2")
+    with pytest.raises(UserError, match="'handover' is unknown; valid: wave"):
+        model.hmm("handover")
+
+
+def saved_model(folder: Path) -> Checkpoint:
+    return load_checkpoint(folder)
+
+
+def test_saved_contact_states_are_the_default_next_time(folder: Path) -> None:
+    before = (folder / "weights.safetensors").read_bytes(), (folder / "config.json").read_bytes()
+    updated = save_contact_states(saved_model(folder), "handshake", frozenset({4}))
+    assert updated.contact_states["handshake"] == frozenset({4})
+    save_contact_states(updated, "rocket", frozenset())
+    again = saved_model(folder)
+    assert again.contact_states == {"handshake": frozenset({4}), "rocket": frozenset()}
+    assert before == ((folder / "weights.safetensors").read_bytes(), (folder / "config.json").read_bytes())
+
+
+def test_invalid_contact_states_are_refused(folder: Path) -> None:
+    with pytest.raises(UserError, match=r"states \[6\] do not exist; valid: 0 to 5"):
+        save_contact_states(saved_model(folder), "handshake", frozenset({6}))
+    (folder / "contact_states.json").write_text('{"handshake": [17]}')
+    with pytest.raises(UserError, match=r"contact_states\.json.*\[17\] do not exist"):
+        saved_model(folder)
+
+
+def test_a_folder_that_cannot_be_written_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    model = saved_model(folder)
+    monkeypatch.setattr("mild_viz.checkpoint.os.replace", refuse)
+    with pytest.raises(UserError, match=r"contact_states\.json cannot be written: Permission denied"):
+        save_contact_states(model, "handshake", frozenset({1}))
+    assert not (folder / "contact_states.json").exists()
+    assert not list(folder.glob(".*"))
