@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from functools import reduce
@@ -14,7 +13,16 @@ import tyro
 
 from mild_viz import paths
 from mild_viz.errors import UserError
-from mild_viz.run_options import OptionalInt, OptionalPath, OptionalText, RunOptions, VariantName, documented
+from mild_viz.run_options import (
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    OptionalVariant,
+    RunOptions,
+    VariantName,
+    check_output,
+    documented,
+)
 
 
 def app(
@@ -22,7 +30,7 @@ def app(
     dataset: str = "demo",
     action: OptionalText = None,
     trial: int = 0,
-    variant: VariantName = "v3.1",
+    variant: OptionalVariant = None,
     robot: str = "pepper",
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -38,11 +46,12 @@ def app(
             for demo, checkpoints/nuisi-pepper for nuisi. Example: --checkpoint checkpoints/nuisi-pepper
         dataset: Recordings to open: demo (built in), nuisi, yumi, handover (see: mild-viz data list).
             Example: --dataset nuisi
-        action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the first one
-            that dataset and model share. Example: --action handshake
-        trial: Trial to show first: its number among the test trials of the action, from 0. Example: --trial 1
+        action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the handshake, if
+            dataset and model have it, else their first one. Example: --action rocket
+        trial: Trial to show first: its number among the trials of the action, from 0, test trials before training
+            trials. Example: --trial 1
         variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
-            has the table). Example: --variant v2.1
+            has the table). Default: v3.1, if the model has it. Example: --variant v2.1
         robot: Robot to control: pepper, or the path of a URDF file with the joints that the model drives; meshes
             named package://... are looked up beside the file. Example: --robot ~/pepper.urdf
         host: Network address to listen on. There is no password: leave it at this machine's own address unless
@@ -53,7 +62,7 @@ def app(
     from mild_viz.dashboard.app import run
 
     run(
-        checkpoint=checkpoint or paths.default_checkpoint(dataset),
+        checkpoint=checkpoint,
         dataset=dataset,
         action=action,
         trial=trial,
@@ -110,6 +119,7 @@ def train(
     variant: tuple[VariantName, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
     seeds: int = 4,
     epochs: OptionalInt = None,
+    seed: int = 0,
     resume: bool = False,
 ) -> None:
     """Train a model: Algorithms 1 and 2 of the paper.
@@ -124,13 +134,14 @@ def train(
         dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset nuisi
         stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
         variant: Variants to train, one or several. Example: --variant v3.1 v3.2
-        seeds: Number of runs from different random starts (seeds 0, 1, ...) to choose from. Example: --seeds 8
+        seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
         epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
+        seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
         resume: Go on from the state in --out, where an earlier run was interrupted.
     """
     from mild_viz.training.run import train as run
 
-    run(dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume)
+    run(dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume, seed=seed)
 
 
 def evaluate(
@@ -149,10 +160,10 @@ def evaluate(
         dataset: Recordings to evaluate on: demo, nuisi, yumi, handover. Example: --dataset nuisi
         json: File for the table, as a list of rows. Default: print only. Example: --json results.json
     """
+    if json is not None:
+        check_output(json, ".json")
     from mild_viz.evaluation.report import evaluate as run
 
-    if json is not None:
-        _check_output(json, ".json")
     run(checkpoint or paths.default_checkpoint(dataset), dataset, json)
 
 
@@ -167,7 +178,7 @@ def rollout(run: RunOptions, out: Path) -> None:
         run: What to run.
         out: File to write. Example: --out rollout.npz
     """
-    _check_output(out, ".npz")
+    check_output(out, ".npz")
     result = run.run()
     result.save(out)
     inference = result.inference
@@ -188,13 +199,13 @@ def record(run: RunOptions, out: Path, csv: OptionalPath = None) -> None:
         csv: The table: one row a frame with time, active state, forward variable, joints, stiffness and distance.
             Example: --csv wave.csv
     """
+    check_output(out, ".html")
+    if csv is not None:
+        check_output(csv, ".csv")
     from mild_viz.dashboard.recorder import record_csv, record_html
     from mild_viz.dashboard.view import ViewSettings
     from mild_viz.robot.model import load_robot
 
-    _check_output(out, ".html")
-    if csv is not None:
-        _check_output(csv, ".csv")
     result = run.run()
     record_html(result, load_robot(run.robot, result.inference.joint_names), ViewSettings(), out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {result.inference.n_windows} frames")
@@ -222,18 +233,6 @@ def import_published(file: tyro.conf.Positional[Path], out: Path) -> None:
 def _leave(status: int | None) -> None:
     if status:
         raise SystemExit(status)
-
-
-def _check_output(path: Path, suffix: str) -> None:
-    """Refuse a file that cannot be written before the work is done, not after."""
-    if path.suffix.lower() != suffix:
-        raise UserError(f"{path}: the name must end in {suffix}")
-    if path.is_dir():
-        raise UserError(f"{path} is a folder; name a file")
-    if not path.parent.is_dir():
-        raise UserError(f"{path} cannot be written: there is no folder {path.parent}; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise UserError(f"{path} cannot be written: the folder {path.parent} is read-only")
 
 
 def _choice(commands: dict[str, Any]) -> Any:

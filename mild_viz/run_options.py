@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import tyro
 
 from mild_viz import paths
+from mild_viz.errors import UserError
 
 if TYPE_CHECKING:
     from mild_viz.rollout import Rollout
@@ -23,6 +25,9 @@ SplitName = Literal["train", "test"]
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+OptionalVariant = Annotated[
+    VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2}", help_behavior_hint="")
+]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]
 OptionalPosition = Annotated[
@@ -36,6 +41,18 @@ def documented(command: T) -> T:
     """Join the broken lines of each option's description: tyro would print the breaks of the source."""
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(command.__doc__ or ""))
     return command
+
+
+def check_output(path: Path, suffix: str) -> None:
+    """Refuse a file that cannot be written before the work is done, not after."""
+    if path.suffix.lower() != suffix:
+        raise UserError(f"{path}: the name must end in {suffix}")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        raise UserError(f"{path} cannot be written: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"{path} cannot be written: the folder {path.parent} is read-only")
 
 
 @documented

@@ -91,7 +91,7 @@ def test_choices_are_those_of_the_tables() -> None:
         ("data fetch nothing", "nothing"),
         ("data check {tmp}/none.npz", "none.npz"),
         ("import-published {tmp}/none.pth --out {tmp}/run", "none.pth does not exist"),
-        ("app --dataset nothing", "no model ships for dataset 'nothing'"),
+        ("app --dataset nothing", "'nothing' is unknown; valid: demo"),
     ],
 )
 def test_unusable_input_is_refused_with_a_message(
