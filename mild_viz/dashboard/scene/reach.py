@@ -1,0 +1,72 @@
+"""The gap between the robot's hand and the human's: a line with its length, and contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+from mild_viz.dashboard.scene.labels import NOTE, add_label
+from mild_viz.dashboard.scene.palette import Palette, linear
+from mild_viz.rollout import Rollout
+
+ROOT = "/reach"
+
+
+class ReachView:
+    """Draws `hand_distance` where it is."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._frame = server.scene.add_frame(ROOT, show_axes=False)
+        self._line = server.scene.add_line_segments(
+            f"{ROOT}/line", np.zeros((1, 2, 3)), (0, 0, 0), thickness=3.0, thickness_units="screen"
+        )
+        self._contact = server.scene.add_icosphere(
+            f"{ROOT}/contact", radius=0.085, opacity=0.3, cast_shadow=False, receive_shadow=False
+        )
+        self._text = add_label(server, f"{ROOT}/distance", "", NOTE, "top-center")
+        self._rollout: Rollout | None = None
+
+    def show(self, rollout: Rollout, colors: Palette, visible: bool) -> None:
+        """Take over a rollout."""
+        self._rollout = rollout
+        self._frame.visible = visible
+        self._ends = np.nan_to_num(np.stack([rollout.end_effector, rollout.target], axis=1))
+        self._texts = distance_texts(rollout)
+        self._label_positions = np.nan_to_num(label_positions(rollout))
+        self._known = np.isfinite(rollout.hand_distance)
+        self._colors = {
+            contact: linear(np.tile(np.array(color, dtype=np.uint8), (1, 2, 1)))
+            for contact, color in ((True, colors.contact), (False, colors.distance))
+        }
+        self._contact.color = colors.contact
+
+    def set_frame(self, n: int) -> None:
+        """Show frame n."""
+        if self._rollout is None:
+            return
+        known, contact = bool(self._known[n]), bool(self._rollout.contact[n])
+        self._line.visible = self._text.visible = known
+        self._contact.visible = known and contact
+        if not known:
+            return
+        self._line.points = self._ends[n : n + 1]
+        self._line.colors = self._colors[contact]
+        self._contact.position = self._ends[n].mean(0)
+        self._text.text = self._texts[n]
+        self._text.position = self._label_positions[n]
+
+
+def distance_texts(rollout: Rollout) -> list[str]:
+    """What is written at the line in every frame."""
+    return [
+        f"{100.0 * distance:.0f} cm" + (" · contact" if contact else "")
+        for distance, contact in zip(rollout.hand_distance.tolist(), rollout.contact.tolist(), strict=True)
+    ]
+
+
+def label_positions(rollout: Rollout) -> Float[np.ndarray, "N 3"]:
+    """Below both hands, so that the text hides neither."""
+    middle = 0.5 * (rollout.end_effector + rollout.target)
+    middle[:, 2] = np.minimum(rollout.end_effector[:, 2], rollout.target[:, 2]) - 0.12
+    return middle

@@ -1,0 +1,135 @@
+"""The scene of one page: human, robot and latent plot side by side."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+from mild_viz.dashboard.scene import body
+from mild_viz.dashboard.scene.figure import Figure, make_figure
+from mild_viz.dashboard.scene.ground import GroundView
+from mild_viz.dashboard.scene.human import HumanView
+from mild_viz.dashboard.scene.latent import LatentFrames, LatentView, latent_frames
+from mild_viz.dashboard.scene.layout import CAMERAS, WIDEST, Camera, Layout, camera, make_layout
+from mild_viz.dashboard.scene.palette import palette
+from mild_viz.dashboard.scene.reach import ReachView
+from mild_viz.dashboard.scene.robot import RobotView, robot_frames
+from mild_viz.dashboard.view import ViewSettings
+from mild_viz.rollout import Rollout
+
+if TYPE_CHECKING:
+    from mild_viz.robot.model import RobotModel
+
+__all__ = ["CAMERAS", "Scene"]
+
+
+class Scene:
+    """Draws rollouts on one viser server. `show` and `set_frame` may be called from different threads."""
+
+    def __init__(self, server: viser.ViserServer, robot: RobotModel, dark: bool) -> None:
+        self._server = server
+        self._lock = threading.Lock()
+        self._rollout: Rollout | None = None
+        self._view: ViewSettings | None = None
+        self._figure: Figure | None = None
+        self._latent_frames: LatentFrames | None = None
+        self._layout: Layout | None = None
+        self._frame = 0
+        self._ground = GroundView(server)
+        colors = palette(dark)
+        self._human = HumanView(server, colors)
+        self._robot = RobotView(server, robot.visuals, tuple(robot.link_names), robot.name)
+        self._latent = LatentView(server, colors)
+        self._reach = ReachView(server)
+
+    @property
+    def layout(self) -> Layout | None:
+        """Where the groups of the rollout stand; None before the first `show`."""
+        return self._layout
+
+    def show(self, rollout: Rollout, view: ViewSettings) -> None:
+        """Take over a rollout and a view, and stay at the frame that was shown.
+
+        What the new rollout shares with the last one is not computed again: a control-only rerun keeps the
+        figure and the latent plot.
+        """
+        inference = rollout.inference
+        last = self._rollout.inference if self._rollout is not None else None
+        figure, frames = self._figure, self._latent_frames
+        if figure is None or inference is not last:
+            figure = make_figure(inference)
+        if frames is None or inference is not last or latent_view(view) != latent_view(self._view):
+            frames = latent_frames(inference, view)
+        arms = robot_frames(rollout)
+        bounds = self._robot.bounds(rollout)
+        layout = scene_layout(rollout, figure, bounds)
+        colors = palette(view.dark)
+        with self._lock, self._server.atomic():
+            self._ground.show(layout.floor, bounds[0, 2], colors)
+            if self._layout is None:
+                self._set_initial_camera(camera("both", layout))
+            self._rollout, self._view, self._layout = rollout, view, layout
+            self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human)
+            self._robot.show(arms, layout.robot_top, rollout.controller, colors, view.show_robot, view.ghost)
+            self._reach.show(rollout, colors, view.show_human and view.show_robot)
+            self._latent.show(frames, layout, colors, view.show_latent)
+            self._figure, self._latent_frames = figure, frames
+            self._set_frame(min(self._frame, inference.n_windows - 1))
+
+    def set_frame(self, n: int) -> None:
+        """Show frame n; one beyond the end shows the last."""
+        with self._lock:
+            if self._rollout is not None:
+                with self._server.atomic():
+                    self._set_frame(min(max(n, 0), self._rollout.inference.n_windows - 1))
+
+    def camera(self, name: str, aspect: float = WIDEST) -> Camera:
+        """One of `CAMERAS` for the present layout."""
+        assert self._layout is not None, "show() comes first"
+        return camera(name, self._layout, aspect)
+
+    def move_camera(self, client: viser.ClientHandle, name: str) -> None:
+        """Take one client's camera to a preset, fitted to that client's canvas."""
+        view = self.camera(name, client.camera.image_width / max(client.camera.image_height, 1))
+        with client.atomic():
+            client.camera.position = view.position
+            client.camera.look_at = view.look_at
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.fov = view.fov
+
+    def _set_frame(self, n: int) -> None:
+        self._frame = n
+        self._human.set_frame(n)
+        self._robot.set_frame(n)
+        self._reach.set_frame(n)
+        self._latent.set_frame(n)
+
+    def _set_initial_camera(self, view: Camera) -> None:
+        initial = self._server.initial_camera
+        initial.position, initial.look_at = view.position, view.look_at
+        initial.up, initial.fov = (0.0, 0.0, 1.0), view.fov
+
+
+def latent_view(view: ViewSettings | None) -> tuple[object, ...]:
+    """The part of the view that the latent arrays depend on."""
+    return () if view is None else (view.alpha_mode, view.latent_axes, view.sigma)
+
+
+def scene_layout(rollout: Rollout, figure: Figure, bounds: Float[np.ndarray, "2 3"]) -> Layout:
+    """The layout of a rollout: the human stands on the floor, the robot on it too or on a pedestal."""
+    T = rollout.T_world_human
+    up = T[:3, :3].T @ [0.0, 0.0, 1.0]
+    middle, height = figure.shoulders, figure.height
+    crown, eye, sole = (
+        T[:3, :3] @ point + T[:3, 3]
+        for point in (figure.crown, figure.crown - 0.07 * height * up, middle - body.COLLAR_SHARE * height * up)
+    )
+    feet = float(sole[2]) if figure.soles is None else float((T[:3, :3] @ figure.soles + T[:3, 3])[2])
+    distance = np.where(np.isfinite(rollout.hand_distance), rollout.hand_distance, np.inf)
+    hand = np.nan_to_num(rollout.target[int(distance.argmin())])
+    robot_top = np.array([0.0, 0.0, bounds[1, 2]])
+    return make_layout(T, robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet))
