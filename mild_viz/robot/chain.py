@@ -36,7 +36,7 @@ class ArmChain:
     upper: Float[np.ndarray, " J"]
     rest: Float[np.ndarray, " J"]
     """Where the joints stand when nothing moves them [rad]."""
-    offsets: Float[np.ndarray, "J+1 4 4"]
+    offsets: Float[np.ndarray, "_ 4 4"]
     axes: Float[np.ndarray, "J 3"]
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class ArmChain:
         return len(self.joint_names)
 
     @cached_property
-    def arm(self) -> Float[np.ndarray, "J+1 12"]:
+    def arm(self) -> Float[np.ndarray, "_ 12"]:
         """The arm as the kernels take it (see `kernels`). Writable, because numba types read-only arrays apart."""
         arm = np.zeros((self.n_joints + 1, 12))
         arm[:, :4] = quaternions(self.offsets[:, :3, :3])
@@ -114,7 +114,7 @@ def cache_folder() -> Path:
 
 def _cached_fold(
     description: Description, joint_names: tuple[str, ...], end_effector: str, values: dict[str, float]
-) -> tuple[Float[np.ndarray, "J+1 4 4"], Float[np.ndarray, "J 3"]]:
+) -> tuple[Float[np.ndarray, "_ 4 4"], Float[np.ndarray, "J 3"]]:
     """`_fold`, read from the cache where it is there and sound, else computed and kept there if possible."""
     resting = [(joint.name, values[joint.name]) for joint in description.path_to(end_effector)]
     question = json.dumps([FOLD_VERSION, description.digest, joint_names, end_effector, resting])
@@ -136,7 +136,7 @@ def _cached_fold(
 
 def _fold(
     description: Description, joint_names: tuple[str, ...], end_effector: str, values: dict[str, float]
-) -> tuple[Float[np.ndarray, "J+1 4 4"], Float[np.ndarray, "J 3"]]:
+) -> tuple[Float[np.ndarray, "_ 4 4"], Float[np.ndarray, "J 3"]]:
     """Multiply the fixed transforms between controlled joints, as pytorch-kinematics parses them."""
     import pytorch_kinematics as pk  # slow: it imports torch
 

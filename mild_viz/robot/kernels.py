@@ -45,8 +45,7 @@ def rotate(w, x, y, z, vx, vy, vz):
 @njit(cache=True, fastmath=False)
 def arm_forward(arm, q, origins, directions, position):
     """Forward kinematics: fills joint `origins` and `directions` (J, 3) and the end's `position` (3,)."""
-    w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    px, py, pz = 0.0, 0.0, 0.0
+    w, x, y, z, px, py, pz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     n = q.shape[0]
     for i in range(n + 1):
         dx, dy, dz = rotate(w, x, y, z, arm[i, 4], arm[i, 5], arm[i, 6])
@@ -86,9 +85,8 @@ def kinematics_batch(arm, joints):
 @njit(cache=True, fastmath=False)
 def _objective(position, target, q, prior, lambda_x, lambda_q):
     """Eq. ik-prior-simplified."""
-    reach, stray = 0.0, 0.0
-    for i in range(3):
-        reach += (position[i] - target[i]) ** 2
+    reach = (position[0] - target[0]) ** 2 + (position[1] - target[1]) ** 2 + (position[2] - target[2]) ** 2
+    stray = 0.0
     for i in range(q.shape[0]):
         stray += (q[i] - prior[i]) ** 2
     return lambda_x * reach + lambda_q * stray
@@ -169,15 +167,13 @@ def _bounded_step(arm, hessian, damping, gradient, q, step, fixed, factor, rhs):
     for i in range(n):
         step[i], fixed[i] = 0.0, _held(arm, q, gradient, i)
     inside = False
-    while not inside:
-        if not _free_step(hessian, damping, gradient, step, fixed, factor, rhs):
-            return False
+    while not inside and _free_step(hessian, damping, gradient, step, fixed, factor, rhs):
         inside = True
         for i in range(n):
             if not fixed[i] and not arm[i, LOWER] <= q[i] + step[i] <= arm[i, UPPER]:
                 bound = arm[i, LOWER] if q[i] + step[i] < arm[i, LOWER] else arm[i, UPPER]
                 step[i], fixed[i], inside = bound - q[i], True, False
-    return True
+    return inside
 
 
 @njit(cache=True, fastmath=False)
@@ -220,6 +216,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
                 predicted = 0.0
                 for i in range(n):
                     candidate[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
+                    if fixed[i] and step[i] != 0.0:  # exactly on the limit, where rounding would miss it
+                        candidate[i] = arm[i, UPPER if step[i] > 0.0 else LOWER]
                     predicted -= 2.0 * step[i] * gradient[i]
                     for j in range(n):
                         predicted -= step[i] * hessian[i, j] * step[j]
@@ -232,20 +230,9 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
                 damping, growth = (damping if damping > 1e-12 * scale else 0.0), 2.0
             else:
                 damping, growth = max(damping * growth, 1e-3 * scale), 2.0 * growth
-        if not improved:
+        if not improved or (candidate == q).all():
             break
-        change = 0.0
-        for i in range(n):
-            change = max(change, abs(candidate[i] - q[i]))
-            q[i] = candidate[i]
-        position[0], position[1], position[2], cost = moved[0], moved[1], moved[2], new_cost
-        if change == 0.0:
-            break
-
-
-@njit(cache=True, fastmath=False)
-def _is_finite(vector):
-    return math.isfinite(vector[0]) and math.isfinite(vector[1]) and math.isfinite(vector[2])
+        q[:], position[:], cost = candidate, moved, new_cost
 
 
 @njit(cache=True, fastmath=False)
@@ -255,11 +242,9 @@ def solve_ik_batch(arm, targets, priors, lambda_x, lambda_q):
     vectors, matrices, fixed = ik_scratch(size)
     solutions = np.empty((n, size))
     for k in range(n):
-        if _is_finite(targets[k]):
+        solutions[k] = np.clip(priors[k], arm[:-1, LOWER], arm[:-1, UPPER])
+        if np.isfinite(targets[k]).all():
             solve_ik_one(arm, targets[k], priors[k], lambda_x, lambda_q, solutions[k], vectors, matrices, fixed)
-            continue
-        for i in range(size):
-            solutions[k, i] = min(max(priors[k, i], arm[i, LOWER]), arm[i, UPPER])
     return solutions
 
 
@@ -291,7 +276,7 @@ def control_loop(
         contact[k] = (contact_states >> active) & 1 == 1
         command, target = commands[k], targets[k]
         prior, weight = (previous, 0.0) if controller == BASE_IK else (decoded[k], lambda_q)
-        if controller != MILD and (contact[k] or controller == BASE_IK) and _is_finite(target):
+        if controller != MILD and (contact[k] or controller == BASE_IK) and np.isfinite(target).all():
             solve_ik_one(arm, target, prior, lambda_x, weight, command, vectors, matrices, fixed)
         else:
             command[:] = prior
