@@ -127,6 +127,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> None:
     try:
         building.chmod(0o755)
         save_file(_tensors(checkpoint), building / WEIGHTS)
+        (building / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
         (building / CONFIG).write_text(json.dumps(_config(checkpoint), indent=2) + "\n")
         (building / README).write_text(readme)
         if path.exists():

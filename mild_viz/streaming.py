@@ -17,6 +17,7 @@ from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import HMM, forward_filter, log_emission
 from mild_viz.latent.vae import VAE
 from mild_viz.pipeline import with_contact_states
+from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.settings import VARIANTS, WINDOW, ControlSettings
@@ -118,7 +119,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
     decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if carry.previous is None else carry.previous[6:9]
-    target = (hand @ model.T_world_human[:3, :3].T + model.T_world_human[:3, 3])[None]
+    target = in_frame(model.T_world_human, hand[None])
     result = run_controller(model.robot.chain, model.settings, model.action, log_alpha, decoded, target, carry.control)
     command = Command(
         log_alpha=log_alpha[0],

@@ -176,7 +176,7 @@ def test_wrong_choices_list_the_valid_ones(model: Checkpoint, robot: RobotModel,
     with pytest.raises(UserError, match="controller 'pid' is unknown; valid: base-ik, mild, mild-ik"):
         ControlSettings(controller="pid")
     with pytest.raises(UserError, match="lambda_q is -1"):
-        ControlSettings(lambda_q=-1)
+        ControlSettings(lambda_q=-1.0)
     short = replace(
         handshake, human_arm=handshake.human_arm[:9], partner_arm=None, phase=None, human_skeleton=None,
         partner_skeleton=None, robot_joints=np.zeros((9, 4)), robot_joint_names=model.for_robot().joint_names,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,6 +24,7 @@ class Examples:
         return Examples(self.human[keep], self.partner[keep], self.step[keep], self.trial[keep])
 
 
+T = TypeVar("T")
 Predictor = Callable[[Examples], Float[np.ndarray, "R Y"]]
 
 
@@ -76,7 +78,7 @@ def leave_one_trial_out(train: Examples, fit: Callable[[Examples], Predictor]) -
     return total / len(trials)
 
 
-def _chosen(train: Examples, fit: Callable[[Examples, float], Predictor], values: Sequence[float]) -> Predictor:
+def _chosen(train: Examples, fit: Callable[[Examples, T], Predictor], values: Sequence[T]) -> Predictor:
     """`fit` with the value that leave-one-trial-out likes best on the training trials."""
     if len(np.unique(train.trial)) < 2:
         return fit(train, values[len(values) // 2])
@@ -91,6 +93,6 @@ BASELINES: dict[str, Callable[[Examples], Predictor]] = {
     "constant": fit_constant,
     "time-indexed": fit_time_indexed,
     "ridge": lambda train: _chosen(train, fit_ridge, RIDGE_STRENGTHS),
-    "knn": lambda train: _chosen(train, lambda rest, k: fit_nearest(rest, int(k)), NEIGHBOURS),
+    "knn": lambda train: _chosen(train, lambda rest, k: fit_nearest(rest, k), NEIGHBOURS),
 }
 """Name -> fit on training examples of one action. Strength and k are chosen on training trials only."""

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import tempfile
+import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -120,10 +121,10 @@ def _cached_fold(
     question = json.dumps([FOLD_VERSION, description.digest, joint_names, end_effector, resting])
     file = cache_folder() / f"{hashlib.sha256(question.encode()).hexdigest()}.npz"
     n = len(joint_names)
-    with contextlib.suppress(Exception):  # missing or damaged in whatever way: fold again
-        with np.load(file, allow_pickle=False) as arrays:
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # missing or damaged
+        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as arrays:
             offsets, axes = arrays["offsets"], arrays["axes"]
-        if offsets.shape == (n + 1, 4, 4) and axes.shape == (n, 3) and np.isfinite(offsets).all():
+        if offsets.shape == (n + 1, 4, 4) and axes.shape == (n, 3) and np.isfinite(np.append(offsets, axes)).all():
             return offsets, axes
     offsets, axes = _fold(description, joint_names, end_effector, values)
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else

@@ -80,7 +80,8 @@ def arm_length(arm: Float[np.ndarray, "T 3 3"]) -> float:
 
 def in_frame(T_a_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
     """Points given in frame b, seen in frame a."""
-    return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    # einsum sums every row alike, however many there are: one point alone gives the same bits.
+    return np.einsum("ij,nj->ni", T_a_b[:3, :3], points) + T_a_b[:3, 3]
 
 
 def _extension(arm: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:

@@ -209,6 +209,13 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
             if not _held(arm, q, gradient, i):
                 largest = max(largest, 2.0 * abs(gradient[i]))
         if largest <= TOLERANCE * max(1.0, scale):
+            # One more Newton step squares what is left, so that a prior that differs by rounding (one
+            # observation at a time instead of all) gives the same solution to rounding. Where the arm can turn
+            # freely about its solution (no prior), the step is no such refinement and would be large.
+            if _bounded_step(arm, hessian, 0.0, gradient, q, step, fixed, factor, rhs):
+                for i in range(n):
+                    if not fixed[i] and abs(step[i]) < 1e-6:
+                        q[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
             break
         improved = False
         while not improved and damping < 1e6 * scale:
