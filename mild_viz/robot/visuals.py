@@ -99,6 +99,8 @@ def _load_visual(description: Description, visual: Any) -> list[Part]:
             solids = [solid for solid in trimesh.load_scene(file).dump() if isinstance(solid, trimesh.Trimesh)]
         except Exception as error:  # whatever the reader of the file's format raises
             raise UserError(f"{file} cannot be read as a mesh: {error}") from error
+        if not any(len(solid.faces) for solid in solids):
+            raise UserError(f"{file} cannot be read as a mesh: it holds no triangles")
         if shape.mesh.scale is not None:
             scale = np.broadcast_to(np.asarray(shape.mesh.scale, dtype=np.float64), 3)
     transform = np.eye(4) if visual.origin is None else np.array(visual.origin, dtype=np.float64)
