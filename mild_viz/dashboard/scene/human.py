@@ -87,8 +87,8 @@ class HumanView:
                 last.remove()
             return
         self._schematic[name] = self._server.scene.add_mesh_simple(
-            f"{ROOT}/schematic/{name}", *mesh, color=self._colors.schematic, opacity=self._colors.schematic_opacity, cast_shadow=False,
-            receive_shadow=False,
+            f"{ROOT}/schematic/{name}", *mesh, color=self._colors.schematic, opacity=self._colors.schematic_opacity,
+            cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     def _recolor(self) -> None:

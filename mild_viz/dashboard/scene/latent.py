@@ -33,7 +33,7 @@ TEXT_SIZE = (0.085, 0.072)
 AGENTS = ("human", "robot")
 TRACES = ("human", "truth", "prediction")
 
-Segments = Float[np.ndarray, "K 2 3"]
+Segments = Float[np.ndarray, "_ 2 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class LatentView:
 
     def _draw_box(self, projection: Projection, colors: Palette) -> None:
         step, ticks = projection.ticks()
-        lines = [np.array(grid_lines(ticks)), np.array(axis_lines())]
+        lines = [grid_lines(ticks), box_edges()]
         tints = [np.tile(colors.grid_section, (len(lines[0]), 2, 1)), np.tile(colors.frame, (len(lines[1]), 2, 1))]
         self._line("box", np.concatenate(lines), np.concatenate(tints).astype(np.uint8), 1.0)
         offset = HALF + 0.085
@@ -238,26 +238,27 @@ def spread(spots: Float[np.ndarray, "K 3"], steps: int = 60) -> Float[np.ndarray
     return spots
 
 
-def grid_lines(ticks: list[Float[np.ndarray, " K"]]) -> list[list[tuple[float, float, float]]]:
+def grid_lines(ticks: list[Float[np.ndarray, " _"]]) -> Segments:
     """Lines on the three planes behind the trajectories: floor (low z), low x, high y."""
-    lines: list[list[tuple[float, float, float]]] = []
-    for x in ticks[0]:
-        lines += [[(x, -HALF, -HALF), (x, HALF, -HALF)], [(x, HALF, -HALF), (x, HALF, HALF)]]
-    for y in ticks[1]:
-        lines += [[(-HALF, y, -HALF), (HALF, y, -HALF)], [(-HALF, y, -HALF), (-HALF, y, HALF)]]
-    for z in ticks[2]:
-        lines += [[(-HALF, -HALF, z), (-HALF, HALF, z)], [(-HALF, HALF, z), (HALF, HALF, z)]]
-    return lines
+    low, high = -HALF, HALF
+    lines = []
+    for x in ticks[0].tolist():
+        lines += [[(x, low, low), (x, high, low)], [(x, high, low), (x, high, high)]]
+    for y in ticks[1].tolist():
+        lines += [[(low, y, low), (high, y, low)], [(low, y, low), (low, y, high)]]
+    for z in ticks[2].tolist():
+        lines += [[(low, low, z), (low, high, z)], [(low, high, z), (high, high, z)]]
+    return np.array(lines).reshape(-1, 2, 3)
 
 
-def axis_lines() -> list[list[tuple[float, float, float]]]:
+def box_edges() -> Segments:
     """Edges of the three planes."""
     a, b = -HALF, HALF
-    return [
+    return np.array([
         [(a, a, a), (b, a, a)], [(b, a, a), (b, b, a)], [(a, a, a), (a, b, a)], [(a, b, a), (b, b, a)],
         [(a, a, a), (a, a, b)], [(a, b, a), (a, b, b)], [(b, b, a), (b, b, b)], [(a, a, b), (a, b, b)],
         [(a, b, b), (b, b, b)],
-    ]  # fmt: skip
+    ])  # fmt: skip
 
 
 def solid_color(color: Rgb, count: int) -> np.ndarray:

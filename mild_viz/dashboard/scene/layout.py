@@ -81,8 +81,8 @@ def make_layout(
     return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
 
 
-def camera(name: str, layout: Layout, aspect: float = WIDEST) -> Camera:
-    """One of `CAMERAS` for a canvas of the given width over height."""
+def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 0.0) -> Camera:
+    """One of `CAMERAS` for a canvas of the given width over height, with more space above the titles [m]."""
     choose("camera", name, CAMERAS)
     floor, up = layout.floor, np.array([0.0, 0.0, 1.0])
     if name == "participant":
@@ -93,12 +93,13 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST) -> Camera:
         for a in (-1, 1)
         for b in (-1, 1)
         for c in (-1.15, 1.0)
-    ] + [layout.plot_title + 0.12 * up]
+    ] + [layout.plot_title + (0.12 + headroom) * up]
     if name == "latent":
         direction = layout.side + 0.12 * layout.forward + 0.28 * up
         return fitted(np.array(plot), direction, aspect, margin=0.06)
     foot = layout.human_top * [1.0, 1.0, 0.0] + floor * up
-    dyad = [layout.robot_top + 0.27 * up - 0.34 * layout.forward, layout.human_top + 0.27 * up + 0.26 * layout.forward]
+    above = (0.27 + headroom) * up
+    dyad = [layout.robot_top + above - 0.34 * layout.forward, layout.human_top + above + 0.26 * layout.forward]
     dyad += [floor * up + 0.36 * (b * layout.side - layout.forward) for b in (-1, 1)]
     dyad += [foot + 0.24 * (b * layout.side + layout.forward) for b in (-1, 1)]
     if name == "experimenter":

@@ -52,7 +52,7 @@ class Projection:
         radii = sigma * np.sqrt(np.maximum(values, 0.0))
         return centres, quaternion_from_matrix(vectors), np.clip(radii, SMALLEST_RADIUS, LARGEST_RADIUS)
 
-    def ticks(self) -> tuple[float, list[Float[np.ndarray, " K"]]]:
+    def ticks(self) -> tuple[float, list[Float[np.ndarray, " _"]]]:
         """The spacing of the grid in latent units, and the box coordinates [m] of its lines along each axis."""
         half = 0.5 * PLOT_SIZE
         step = nice_step(PLOT_SIZE / float(self.scale.min()) / 5.0)

@@ -60,7 +60,7 @@ class ReachView:
 def distance_texts(rollout: Rollout) -> list[str]:
     """What is written at the line in every frame."""
     return [
-        f"{100.0 * distance:.0f} cm" + (" · contact" if contact else "")
+        f"{100.0 * distance:.1f} cm" + (" · contact" if contact else "")
         for distance, contact in zip(rollout.hand_distance.tolist(), rollout.contact.tolist(), strict=True)
     ]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
@@ -19,12 +18,10 @@ from mild_viz.dashboard.scene.palette import palette
 from mild_viz.dashboard.scene.reach import ReachView
 from mild_viz.dashboard.scene.robot import RobotView, robot_frames
 from mild_viz.dashboard.view import ViewSettings
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 
-if TYPE_CHECKING:
-    from mild_viz.robot.model import RobotModel
-
-__all__ = ["CAMERAS", "Scene"]
+__all__ = ["CAMERAS", "Scene", "fill_initial_camera"]
 
 
 class Scene:
@@ -71,7 +68,7 @@ class Scene:
         with self._lock, self._server.atomic():
             self._ground.show(layout.floor, bounds[0, 2], colors)
             if self._layout is None:
-                self._set_initial_camera(camera("both", layout))
+                fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
             self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human)
             self._robot.show(arms, layout.robot_top, rollout.controller, colors, view.show_robot, view.ghost)
@@ -87,10 +84,10 @@ class Scene:
                 with self._server.atomic():
                     self._set_frame(min(max(n, 0), self._rollout.inference.n_windows - 1))
 
-    def camera(self, name: str, aspect: float = WIDEST) -> Camera:
+    def camera(self, name: str, aspect: float = WIDEST, headroom: float = 0.0) -> Camera:
         """One of `CAMERAS` for the present layout."""
         assert self._layout is not None, "show() comes first"
-        return camera(name, self._layout, aspect)
+        return camera(name, self._layout, aspect, headroom)
 
     def move_camera(self, client: viser.ClientHandle, name: str) -> None:
         """Take one client's camera to a preset, fitted to that client's canvas."""
@@ -108,10 +105,12 @@ class Scene:
         self._reach.set_frame(n)
         self._latent.set_frame(n)
 
-    def _set_initial_camera(self, view: Camera) -> None:
-        initial = self._server.initial_camera
-        initial.position, initial.look_at = view.position, view.look_at
-        initial.up, initial.fov = (0.0, 0.0, 1.0), view.fov
+
+def fill_initial_camera(server: viser.ViserServer, view: Camera) -> None:
+    """Where new browsers start, and where 'Reset view' returns to."""
+    initial = server.initial_camera
+    initial.position, initial.look_at = view.position, view.look_at
+    initial.up, initial.fov = (0.0, 0.0, 1.0), view.fov
 
 
 def latent_view(view: ViewSettings | None) -> tuple[object, ...]:
