@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.ik import forward, jacobian, solve_ik
-from mild_viz.robot.kernels import kinematics_batch
+from mild_viz.robot.kinematics.kernels import kinematics_batch
 from mild_viz.robot.model import load_robot
 
 KINDS = ("near", "far", "unreachable")

@@ -49,7 +49,7 @@ class ArmChain:
 
     @cached_property
     def arm(self) -> Float[np.ndarray, "_ 12"]:
-        """The arm as the kernels take it (see `kernels`). Writable, because numba types read-only arrays apart."""
+        """The arm as `kinematics.kernels` takes it. Writable, because numba types read-only arrays apart."""
         arm = np.zeros((self.n_joints + 1, 12))
         arm[:, :4] = quaternions(self.offsets[:, :3, :3])
         arm[:, 4:7] = self.offsets[:, :3, 3]

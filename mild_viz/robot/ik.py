@@ -28,13 +28,13 @@ def solve_ik(
 
 def forward(chain: ArmChain, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N 3"]:
     """End effector position f(q) [m] in the base frame at N joint vectors [rad]."""
-    from mild_viz.robot.kernels import kinematics_batch
+    from mild_viz.robot.kinematics.kernels import kinematics_batch
 
     return kinematics_batch(chain.arm, kernel_array(joints))[0]
 
 
 def jacobian(chain: ArmChain, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N J 3"]:
     """Derivative of `forward` by each joint [m/rad]."""
-    from mild_viz.robot.kernels import kinematics_batch
+    from mild_viz.robot.kinematics.kernels import kinematics_batch
 
     return kinematics_batch(chain.arm, kernel_array(joints))[1]

@@ -1,9 +1,8 @@
-"""Compiled kernels of the arm: kinematics, inverse kinematics with a joint prior, the control loop.
+"""Compiled kernels of inverse kinematics with a joint prior, and of the control loop.
 
-They stay in one file because numba's cache notices changes only in a function's own file. Everything works
-on plain float64 arrays. An arm is one array (J+1, 12); row i holds the fixed transform before joint i as a
-quaternion (wxyz) and a translation, the joint's axis, its lower and its upper limit; in the last row only
-the transform to the end effector counts. The typed wrappers live in `chain`, `ik` and `controller`.
+They work on plain float64 arrays; an arm is laid out as `kinematics.kernels` says. The typed wrappers are
+`ik` and `controller`. Kernels that call each other are kept together where possible, because numba's cache
+notices changes only in a function's own file: after a change in kinematics/kernels.py, remove __pycache__ here.
 """
 
 import math
@@ -11,8 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-AXIS, LOWER, UPPER, WIDTH = 7, 10, 11, 12
-"""Columns of an arm array (the quaternion starts at 0, the translation at 4), and its width."""
+from mild_viz.robot.kinematics.kernels import LOWER, UPPER, arm_forward, arm_jacobian
 
 BASE_IK, MILD, MILD_IK = 0, 1, 2
 """Controllers, in the order of `settings.CONTROLLERS`."""
@@ -23,63 +21,6 @@ STARTED, IN_CONTACT, VISITED = 0, 1, 2
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-10
 """Largest projected gradient at which the solver stops, relative to the larger weight (at least 1)."""
-
-
-@njit(cache=True, fastmath=False)
-def multiply(aw, ax, ay, az, bw, bx, by, bz):
-    """Quaternion product a b."""
-    w = aw * bw - ax * bx - ay * by - az * bz
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
-    return w, x, y, z
-
-
-@njit(cache=True, fastmath=False)
-def rotate(w, x, y, z, vx, vy, vz):
-    """Vector v turned by the unit quaternion (w, x, y, z)."""
-    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
-    return vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx
-
-
-@njit(cache=True, fastmath=False)
-def arm_forward(arm, q, origins, directions, position):
-    """Forward kinematics: fills joint `origins` and `directions` (J, 3) and the end's `position` (3,)."""
-    w, x, y, z, px, py, pz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    n = q.shape[0]
-    for i in range(n + 1):
-        dx, dy, dz = rotate(w, x, y, z, arm[i, 4], arm[i, 5], arm[i, 6])
-        px, py, pz = px + dx, py + dy, pz + dz
-        if i == n:
-            break
-        w, x, y, z = multiply(w, x, y, z, arm[i, 0], arm[i, 1], arm[i, 2], arm[i, 3])
-        ax, ay, az = arm[i, AXIS], arm[i, AXIS + 1], arm[i, AXIS + 2]
-        origins[i, 0], origins[i, 1], origins[i, 2] = px, py, pz
-        directions[i, 0], directions[i, 1], directions[i, 2] = rotate(w, x, y, z, ax, ay, az)
-        s, c = math.sin(0.5 * q[i]), math.cos(0.5 * q[i])
-        w, x, y, z = multiply(w, x, y, z, c, s * ax, s * ay, s * az)
-    position[0], position[1], position[2] = px, py, pz
-
-
-@njit(cache=True, fastmath=False)
-def arm_jacobian(origins, directions, position, jacobian):
-    """Row i of `jacobian` (J, 3) becomes the derivative of the position by joint i."""
-    for i in range(origins.shape[0]):
-        rx, ry, rz = position[0] - origins[i, 0], position[1] - origins[i, 1], position[2] - origins[i, 2]
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        jacobian[i, 0], jacobian[i, 1], jacobian[i, 2] = dy * rz - dz * ry, dz * rx - dx * rz, dx * ry - dy * rx
-
-
-@njit(cache=True, fastmath=False)
-def kinematics_batch(arm, joints):
-    """End effector positions (N, 3) and their Jacobians (N, J, 3) of N configurations (N, J)."""
-    n, size = joints.shape
-    origins, directions = np.empty((size, 3)), np.empty((size, 3))
-    positions, jacobians = np.empty((n, 3)), np.empty((n, size, 3))
-    for k in range(n):
-        arm_forward(arm, joints[k], origins, directions, positions[k])
-        arm_jacobian(origins, directions, positions[k], jacobians[k])
-    return positions, jacobians
 
 
 @njit(cache=True, fastmath=False)
@@ -177,30 +118,38 @@ def _bounded_step(arm, hessian, damping, gradient, q, step, fixed, factor, rhs):
 
 
 @njit(cache=True, fastmath=False)
-def ik_scratch(n):
-    """Scratch arrays of `solve_ik_one` for n joints."""
-    size = max(n, 3)
-    return np.zeros((6, size)), np.zeros((5, size, size)), np.zeros(n, np.bool_)
+def _copy(source, into):
+    """Slice assignment, which numba takes seconds to compile."""
+    for i in range(into.shape[0]):
+        into[i] = source[i]
 
 
 @njit(cache=True, fastmath=False)
-def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, fixed):
+def ik_scratch(n):
+    """Scratch arrays of `solve_ik_one` for n joints."""
+    return np.empty((4, n)), np.empty((2, 3)), np.empty((3, n, 3)), np.empty((2, n, n)), np.empty(n, np.bool_)
+
+
+@njit(cache=True, fastmath=False)
+def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
     """Bounded Levenberg-Marquardt from the prior (J,), with the exact Hessian; the solution is left in `q`.
 
     Minimises Eq. ik-prior-simplified for a target (3,). No accepted step increases the objective, and no
-    iterate leaves the limits. `vectors`, `matrices`, `fixed` are scratch from `ik_scratch`.
+    iterate leaves the limits; a NaN target leaves the clipped prior. `scratch` is `ik_scratch(J)`.
     """
     n = q.shape[0]
-    gradient, step, candidate, rhs = vectors[0, :n], vectors[1, :n], vectors[2, :n], vectors[3, :n]
-    position, moved = vectors[4, :3], vectors[5, :3]
-    hessian, factor = matrices[0, :n, :n], matrices[1, :n, :n]
-    origins, directions, jacobian = matrices[2, :n, :3], matrices[3, :n, :3], matrices[4, :n, :3]
+    vectors, points, frames, squares, fixed = scratch
+    gradient, step, candidate, rhs = vectors[0], vectors[1], vectors[2], vectors[3]
+    position, moved, hessian, factor = points[0], points[1], squares[0], squares[1]
+    origins, directions, jacobian = frames[0], frames[1], frames[2]
     for i in range(n):
         q[i] = min(max(prior[i], arm[i, LOWER]), arm[i, UPPER])
     arm_forward(arm, q, origins, directions, position)
     cost = _objective(position, target, q, prior, lambda_x, lambda_q)
     scale = max(lambda_x, lambda_q)
-    new_cost, damping, growth = cost, 0.0, 2.0
+    new_cost, damping, growth, still = cost, 0.0, 2.0, False
+    if not math.isfinite(cost):  # there is no target
+        return
     for _ in range(MAX_ITERATIONS):
         arm_jacobian(origins, directions, position, jacobian)
         _derivatives(jacobian, directions, position, target, q, prior, lambda_x, lambda_q, gradient, hessian)
@@ -209,9 +158,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
             if not _held(arm, q, gradient, i):
                 largest = max(largest, 2.0 * abs(gradient[i]))
         if largest <= TOLERANCE * max(1.0, scale):
-            # One more Newton step squares what is left, so that a prior that differs by rounding (one
-            # observation at a time instead of all) gives the same solution to rounding. Where the arm can turn
-            # freely about its solution (no prior), the step is no such refinement and would be large.
+            # One more Newton step squares what is left, so that inputs that differ by rounding give the same solution
+            # to rounding. Where the arm can turn freely about its solution, the step would be large, and is not taken.
             if _bounded_step(arm, hessian, 0.0, gradient, q, step, fixed, factor, rhs):
                 for i in range(n):
                     if not fixed[i] and abs(step[i]) < 1e-6:
@@ -220,11 +168,12 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
         improved = False
         while not improved and damping < 1e6 * scale:
             if _bounded_step(arm, hessian, damping, gradient, q, step, fixed, factor, rhs):
-                predicted = 0.0
+                predicted, still = 0.0, True
                 for i in range(n):
                     candidate[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
                     if fixed[i] and step[i] != 0.0:  # exactly on the limit, where rounding would miss it
                         candidate[i] = arm[i, UPPER if step[i] > 0.0 else LOWER]
+                    still = still and candidate[i] == q[i]
                     predicted -= 2.0 * step[i] * gradient[i]
                     for j in range(n):
                         predicted -= step[i] * hessian[i, j] * step[j]
@@ -237,21 +186,21 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, vectors, matrices, f
                 damping, growth = (damping if damping > 1e-12 * scale else 0.0), 2.0
             else:
                 damping, growth = max(damping * growth, 1e-3 * scale), 2.0 * growth
-        if not improved or (candidate == q).all():
+        if not improved or still:
             break
-        q[:], position[:], cost = candidate, moved, new_cost
+        _copy(candidate, q)
+        _copy(moved, position)
+        cost = new_cost
 
 
 @njit(cache=True, fastmath=False)
 def solve_ik_batch(arm, targets, priors, lambda_x, lambda_q):
     """Solve N problems, each from its own prior (N, J); a NaN target (N, 3) gives the clipped prior."""
     n, size = priors.shape
-    vectors, matrices, fixed = ik_scratch(size)
+    scratch = ik_scratch(size)
     solutions = np.empty((n, size))
     for k in range(n):
-        solutions[k] = np.clip(priors[k], arm[:-1, LOWER], arm[:-1, UPPER])
-        if np.isfinite(targets[k]).all():
-            solve_ik_one(arm, targets[k], priors[k], lambda_x, lambda_q, solutions[k], vectors, matrices, fixed)
+        solve_ik_one(arm, targets[k], priors[k], lambda_x, lambda_q, solutions[k], scratch)
     return solutions
 
 
@@ -276,23 +225,23 @@ def control_loop(
     stiffness (N,). `previous` (J,) is the last command; `flags` (3,): see STARTED, IN_CONTACT, VISITED.
     """
     n, size = decoded.shape
-    vectors, matrices, fixed = ik_scratch(size)
+    scratch = ik_scratch(size)
     commands, contact, stiffness = np.empty((n, size)), np.zeros(n, np.bool_), np.ones(n)
     for k in range(n):
         active = _argmax(log_alpha[k], 0)
         contact[k] = (contact_states >> active) & 1 == 1
         command, target = commands[k], targets[k]
         prior, weight = (previous, 0.0) if controller == BASE_IK else (decoded[k], lambda_q)
-        if controller != MILD and (contact[k] or controller == BASE_IK) and np.isfinite(target).all():
-            solve_ik_one(arm, target, prior, lambda_x, weight, command, vectors, matrices, fixed)
+        if controller != MILD and (contact[k] or controller == BASE_IK):
+            solve_ik_one(arm, target, prior, lambda_x, weight, command, scratch)
         else:
-            command[:] = prior
+            _copy(prior, command)
         for i in range(size):
             limited = min(max(command[i], arm[i, LOWER]), arm[i, UPPER])
             if flags[STARTED] == 1:
                 limited = smoothing * limited + (1.0 - smoothing) * previous[i]
             command[i] = min(max(limited, arm[i, LOWER]), arm[i, UPPER])
-        previous[:] = command
+        _copy(command, previous)
         flags[STARTED] = 1
 
         # the segment that drives the stiffness never returns to a state seen before the first contact

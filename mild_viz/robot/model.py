@@ -14,7 +14,7 @@ from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain, load_chain
 from mild_viz.robot.description import Description, read_description
 from mild_viz.robot.ik import forward
-from mild_viz.robot.links.tree import LinkTree, build_tree
+from mild_viz.robot.kinematics.tree import LinkTree, build_tree
 from mild_viz.robot.robots import ROBOTS, find_urdf
 from mild_viz.robot.visuals import drawn_links, load_visuals
 

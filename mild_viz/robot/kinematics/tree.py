@@ -29,7 +29,7 @@ class LinkTree:
 
     def poses(self, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N L 7"]:
         """Pose (wxyz, xyz [m]) of every link in the base frame at N joint vectors [rad]."""
-        from mild_viz.robot.links.kernels import link_pose_batch
+        from mild_viz.robot.kinematics.kernels import link_pose_batch
 
         poses = np.empty((len(joints), *self.resting.shape))
         poses[:] = self.resting

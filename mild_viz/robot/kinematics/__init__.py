@@ -1,0 +1,1 @@
+"""Where the end effector and every drawn link are."""

@@ -1,1 +1,0 @@
-"""Poses of the links that are drawn."""
