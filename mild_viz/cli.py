@@ -179,7 +179,7 @@ def rollout(run: RunOptions, out: Path) -> None:
         out: File to write. Example: --out rollout.npz
     """
     check_output(out, ".npz")
-    result = run.run()
+    result, _ = run.run()
     result.save(out)
     inference = result.inference
     print(
@@ -204,10 +204,9 @@ def record(run: RunOptions, out: Path, csv: OptionalPath = None) -> None:
         check_output(csv, ".csv")
     from mild_viz.dashboard.recorder import record_csv, record_html
     from mild_viz.dashboard.view import ViewSettings
-    from mild_viz.robot.model import load_robot
 
-    result = run.run()
-    record_html(result, load_robot(run.robot, result.inference.joint_names), ViewSettings(), out)
+    result, robot = run.run()
+    record_html(result, robot, ViewSettings(), out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {result.inference.n_windows} frames")
     if csv is not None:
         record_csv(result, csv)

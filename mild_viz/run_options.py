@@ -15,6 +15,7 @@ from mild_viz import paths
 from mild_viz.errors import UserError
 
 if TYPE_CHECKING:
+    from mild_viz.robot.model import RobotModel
     from mild_viz.rollout import Rollout
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
@@ -96,7 +97,7 @@ class RunOptions:
     placement: OptionalPosition = None
     robot: str = "pepper"
 
-    def run(self) -> Rollout:
+    def run(self) -> tuple[Rollout, RobotModel]:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
         from mild_viz.checkpoint import load_checkpoint
         from mild_viz.data.load import load_dataset
@@ -117,4 +118,4 @@ class RunOptions:
             placement=None if self.placement is None else Placement(*self.placement),
         )
         robot = load_robot(self.robot, interface.joint_names, interface.end_effector)
-        return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings)
+        return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings), robot
