@@ -33,7 +33,9 @@ LABEL = "mild_viz"
 class Dashboard:
     """A running page. `stop` ends it."""
 
-    def __init__(self, host: str, port: int, catalog: Catalog, robot: RobotModel, first: InferSettings) -> None:
+    def __init__(
+        self, host: str, port: int, catalog: Catalog, robot: RobotModel, model: str, first: InferSettings
+    ) -> None:
         self.server = open_server(host, port, LABEL)
         self.url = f"http://{host}:{port}"
         self.robot = robot
@@ -42,7 +44,7 @@ class Dashboard:
         self.scene = Scene(self.server, robot, dark=False)
         self.player = Player(self.scene.set_frame, self._tick, lambda: bool(self.server.get_clients()))
         self.controls = Controls(
-            self.server, catalog, first, lambda: self.session.mark_dirty(), self.scene.move_camera,
+            self.server, catalog, first, model, lambda: self.session.mark_dirty(), self.scene.move_camera,
             self._write_html, self._write_csv,
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
@@ -65,13 +67,13 @@ class Dashboard:
         """Called by the session's worker with every new rollout or view."""
         self._set_theme(choice.view.dark)
         self.scene.show(rollout, choice.view)
-        trial = choice.settings.infer
-        restart = is_new and (self.session.choice is None or self.session.choice.settings.infer.trial != trial.trial)
+        before = self.session.choice
+        restart = before is None or before.trial is not choice.trial
         self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
         self.controls.show(rollout, choice)
         self.timeline.show(rollout, choice.view.alpha_mode)
         self._tick(self.player.frame, self.player.playing)
-        if self.session.choice is None:
+        if before is None:
             # Reading all datasets may take seconds: the page stands already, and the list completes itself.
             threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()
 
@@ -155,10 +157,11 @@ def open_dashboard(
     arm = load_robot(robot, interface.joint_names, interface.end_effector)
     catalog = Catalog(arm, folder)
     first = first_settings(recordings, model, action, trial, variant)
-    problem = catalog.problem(catalog.name_of(folder), dataset)
+    name = catalog.name_of(folder)
+    problem = catalog.problem(name, dataset)
     if problem is not None:
         raise UserError(problem)
-    return Dashboard(host, port, catalog, arm, first)
+    return Dashboard(host, port, catalog, arm, name, first)
 
 
 def run(

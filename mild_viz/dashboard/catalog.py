@@ -102,20 +102,29 @@ class Catalog:
         return None
 
     def models(self, dataset: str) -> tuple[str, ...]:
-        """The models that can be used on a dataset, the best first: asked for, made for it, others."""
+        """The models that can be used on a dataset, those made for it first."""
         fitting = [model for model in self.model_paths if self.problem(model, dataset) is None]
         return tuple(sorted(fitting, key=lambda model: self._rank(model, dataset)))
 
-    def _rank(self, model: str, dataset: str) -> tuple[int, str]:
-        if self.model_paths[model] == self.chosen:
-            return 0, model
-        if paths.SHIPPED_MODELS.get(dataset) == model:
-            return 1, model
-        return (2 if self.checkpoint(model).dataset == dataset else 3), model
+    def _rank(self, model: str, dataset: str) -> tuple[bool, bool, bool, str]:
+        made_for_it = self.checkpoint(model).dataset == dataset
+        asked_for = self.model_paths[model] == self.chosen
+        return not made_for_it, not asked_for, paths.SHIPPED_MODELS.get(dataset) != model, model
 
-    def usable_datasets(self) -> tuple[str, ...]:
-        """The datasets that are here and that some model fits."""
-        return tuple(name for name in self.present() if self.models(name))
+    def offers(self) -> tuple[tuple[str, ...], dict[str, str]]:
+        """The datasets that can be shown, and why each other one cannot. Reads them all: this may take seconds."""
+        usable, others = [], {name: f"get it with: mild-viz data fetch {name}" for name in self.absent()}
+        for name in self.present():
+            try:
+                self.dataset(name)
+            except UserError as error:
+                others[name] = str(error)
+                continue
+            if self.models(name):
+                usable.append(name)
+            else:
+                others[name] = "no model here fits it"
+        return tuple(usable), others
 
     def actions(self, model: str, dataset: str) -> tuple[str, ...]:
         """The interactions that both know."""

@@ -19,8 +19,10 @@ from mild_viz.trial import PHASES
 WIDTH, HEIGHT = 1000, 100
 LANES = ("states", "alpha", "joints", "distance", "axis")
 MAX_POINTS = 600
-PHASE_COLORS = ("transparent", "#868e96", "#343a40", "#adb5bd")
-"""True phases: rest, reach, contact, return."""
+PHASE_COLORS = tuple(
+    f"color-mix(in srgb, var(--mantine-color-text) {share}%, var(--mantine-color-body))" for share in (0, 30, 75, 15)
+)
+"""True phases: rest, reach, contact, return. Shades of the theme's ink: colours mean states."""
 
 
 def state_color(state: int) -> str:
@@ -114,6 +116,8 @@ def _strip(values: Int[np.ndarray, " N"], css: str, colors: dict[int, str], name
         left, width = _span(start, end, len(values))
         color, name = colors[value], names[value]
         ink = text_color(color) if color.startswith("#") else "inherit"
+        if color == PHASE_COLORS[PHASES.index("contact")]:
+            ink = "var(--mantine-color-body)"
         shown = name if width > 0.75 * len(name) + 0.8 else ""
         segments.append(
             f'<div class="mv-segment" title="{name}" style="left:{left:.2f}%;width:{width:.2f}%;background:{color};'
@@ -129,14 +133,12 @@ def _states(rollout: Rollout) -> str:
     strip = _strip(inference.active_state, "mv-strip", colors, numbers)
     contact_colors = {0: "transparent", 1: "var(--mantine-color-text)"}
     contact = _strip(rollout.contact.astype(np.int64), "mv-contact", contact_colors, {0: "", 1: ""})
-    plot, note = strip + contact, "bar: contact"
+    plot, note = strip + contact, ""
     if inference.phase is not None:
         phases = range(len(PHASES))
         names = dict(enumerate(PHASES))
         plot += _strip(inference.phase, "mv-phase", {p: PHASE_COLORS[p] for p in phases}, {**names, 0: ""})
-        note = "bar: contact · true phase"
-    if not inference.observed.all():
-        plot = _svg("") + plot
+        note = "true phase"
     css = "mv-states mv-with-phase" if inference.phase is not None else "mv-states"
     return _lane("Active state", note, plot, css=css)
 
@@ -146,7 +148,8 @@ def _alpha(rollout: Rollout, mode: str) -> str:
     alpha = np.exp(inference.log_alpha(mode))
     lines = "".join(_line(alpha[:, s], -0.03, 1.03, color=state_color(s)) for s in range(inference.n_states))
     plot = _svg(_grid(rollout) + _bands(~inference.observed, "mv-lost") + lines)
-    return _lane("Forward variable", escape(mode), plot, ("1", "0"))
+    note = escape(mode) if inference.observed.all() else f"{escape(mode)} · grey: lost"
+    return _lane("Forward variable", note, plot, ("1", "0"))
 
 
 def _joints(rollout: Rollout) -> str:
@@ -172,6 +175,7 @@ def _joints(rollout: Rollout) -> str:
         )
     sample = '<svg viewBox="0 0 22 8"><line class="mv-{}" x1="0" x2="22" y1="4" y2="4"/></svg>'
     key = "".join(f'<span class="mv-key">{sample.format(css)}{css}</span>' for css in ("commanded", "decoded", "truth"))
+    key += '<span class="mv-key"><i class="mv-patch"></i>contact states</span>'
     head = f'<div class="mv-head"><div class="mv-name">Joint angles</div>{key}</div>'
     cursor = '<div class="mv-over"><div class="mv-cursor"></div></div>'
     return f'<div class="mv-lane mv-joints">{head}<div class="mv-rows">{"".join(rows)}</div>{cursor}</div>'

@@ -32,6 +32,7 @@ class Controls:
         server: viser.ViserServer,
         catalog: Catalog,
         first: InferSettings,
+        model: str,
         changed: Callable[[], None],
         move_camera: Callable[[viser.ClientHandle, str], None],
         write_html: Writer,
@@ -49,12 +50,12 @@ class Controls:
         self._error = gui.add_html("", visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Trial"):
-            self._trial = TrialTab(gui, catalog, first, changed)
+            self._trial = TrialTab(gui, catalog, first, model, changed)
         with tabs.add_tab("Robot"):
             self._robot = RobotTab(gui, changed)
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
-            self._states.save.on_click(self._save_contact_states)
+            self._states.save.on_click(lambda _event: self._save_contact_states())
         with tabs.add_tab("View"):
             self._view = ViewTab(gui, changed, move_camera)
         with tabs.add_tab("Record"):
@@ -99,14 +100,13 @@ class Controls:
         for client in self._server.get_clients().values():
             client.add_notification("This could not be done", message, color="red", auto_close_seconds=8.0)
 
-    def _save_contact_states(self, event: viser.GuiEvent) -> None:
+    def _save_contact_states(self) -> None:
         choice = self._choice
-        if choice is None or event.client_id is None:
+        if choice is None:
             return
         states = choice.settings.control.contact_states or frozenset()
         action = choice.trial.action
         try:
-            # What was read last, not what a click in flight may still change: it is what the page shows.
             current = self._catalog.current(choice.checkpoint)
             self._catalog.replace_checkpoint(save_contact_states(current, action, states))
         except UserError as error:
@@ -124,7 +124,7 @@ def header_html(rollout: Rollout, model: str) -> str:
     return (
         f'<div class="mv-header"><b>{escape(inference.dataset)} · {escape(inference.action)} · '
         f"{escape(inference.split)} {inference.trial}</b><br>"
-        f"{escape(inference.variant)} of {escape(model)}, controlled by {escape(rollout.controller)}<br>"
+        f"model {escape(model)}, variant {escape(inference.variant)}, controller {escape(rollout.controller)}<br>"
         f"MSE of this trial <b>{mse}</b></div>"
     )
 

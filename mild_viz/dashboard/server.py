@@ -65,7 +65,7 @@ def check_port(host: str, port: int) -> None:
 
 
 @contextlib.contextmanager
-def _only_from(origins: list[str] | None) -> Iterator[None]:
+def _only_from(origins: list[str | None] | None) -> Iterator[None]:
     """Make the websocket refuse pages of other sites.
 
     viser checks no Origin, so any site that is open in the browser could drive this page. websockets can check
@@ -88,7 +88,9 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     check_port(host, port)
     # A program (a test, a script) sends no Origin. On a network the page's own address cannot be known beforehand.
     names = {f"[{host}]" if ":" in host else host, "localhost", "127.0.0.1"}
-    origins = [None, *(f"http://{name}:{port}" for name in sorted(names))] if is_loopback(host) else None
+    origins: list[str | None] | None = [None, *(f"http://{name}:{port}" for name in sorted(names))]
+    if not is_loopback(host):
+        origins = None
     with _only_from(origins), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its own
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     if server.get_port() != port:

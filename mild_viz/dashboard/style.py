@@ -96,7 +96,7 @@ CHART_CSS = """
   font-size: 10px; font-weight: 600; overflow: hidden; }
 .mv-states { height: 17px; }
 .mv-states.mv-with-phase { height: 29px; }
-.mv-states .mv-name small { display: none; }
+.mv-states .mv-name small { margin-top: 4px; line-height: 11px; }
 .mv-states .mv-name { align-self: flex-start; padding-top: 1px; }
 .mv-states .mv-plot { border-bottom: none; }
 .mv-strip { position: absolute; left: 0; right: 0; top: 0; height: 13px; }
@@ -119,6 +119,8 @@ CHART_CSS = """
 }
 .mv-key { display: inline-flex; align-items: center; gap: 4px; margin-right: 12px; }
 .mv-key svg { position: static; width: 22px; height: 8px; }
+.mv-patch { width: 22px; height: 9px; background: color-mix(in srgb, var(--mantine-color-text) 12%, transparent);
+  border-top: 3px solid var(--mantine-color-text); box-sizing: border-box; }
 .mv-key line { stroke-width: 2; }
 .mv-swatch {
   display: inline-block; width: 0.75em; height: 0.75em; border-radius: 2px; margin-right: 0.35em;

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from mild_viz.checkpoint import Checkpoint
-from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, set_content
+from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, set_content, widget_id
 from mild_viz.rollout import Rollout
 from mild_viz.settings import CONTROLLERS, ControlSettings, Placement
 from mild_viz.trial import Trial
@@ -67,6 +67,13 @@ class RobotTab:
         slider = gui.add_slider(
             f"{name} = {value:g}", *WEIGHT_EXPONENTS, 0.05, float(np.log10(value)), marks=MARKS, hint=hint
         )
+        # The box holds the exponent: say so in front of it.
+        box = f'div:has(> [id="{widget_id(slider)}"]) > .mantine-InputWrapper-root'
+        gui.add_html(
+            f"<style>{box} {{ position: relative; }} {box} input {{ padding-left: 20px !important; }}"
+            f'{box}::before {{ content: "10^"; position: absolute; left: 4px; top: 6px; z-index: 1; font-size: 10px;'
+            " color: var(--mantine-color-dimmed); }</style>"
+        )
         return slider
 
     def read(self, checkpoint: Checkpoint, trial: Trial, contact_states: frozenset[int]) -> ControlSettings:
@@ -94,7 +101,7 @@ class RobotTab:
             self._of, self._to_reset, self._chosen, self._placed = of, False, None, {}
         values = {axis: number(slider) for axis, slider in self._place.items()} if self._placed else {}
         if values != self._placed:
-            self._chosen = Placement(**values, source="chosen on this page")
+            self._chosen = Placement(values["distance"], values["lateral"], values["height"], "chosen on this page")
         return self._chosen
 
     def show(self, rollout: Rollout) -> None:

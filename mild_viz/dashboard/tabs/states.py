@@ -23,6 +23,9 @@ input[id="ID"]:checked { background-color: COLOR; border-color: COLOR; }
 """
 
 
+SAVE_NOTE = "Saving makes these the model's default for this action, here and in the mild-viz commands."
+
+
 class StatesTab:
     """Checkboxes of the contact states of the action that is shown."""
 
@@ -34,7 +37,7 @@ class StatesTab:
         self._of: tuple[object, ...] = ()
         self.save = gui.add_button(
             "Save contact states", icon=viser.Icon.DEVICE_FLOPPY,
-            hint="Make these the model's default for this action, here and in the mild-viz commands.",
+            hint=SAVE_NOTE,
         )  # fmt: skip
         self._saved = gui.add_html("")
 
@@ -58,7 +61,7 @@ class StatesTab:
         if self._of != (checkpoint.human_vae, action):
             self._of = (checkpoint.human_vae, action)
             self.tick(checkpoint.contact_states.get(action, frozenset()))
-            set_content(self._saved, "")
+            self.say_saved(SAVE_NOTE)
         return frozenset(state for state in range(checkpoint.n_states) if self._boxes[state].value)
 
     def tick(self, states: frozenset[int]) -> None:

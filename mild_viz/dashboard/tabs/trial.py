@@ -19,18 +19,19 @@ from mild_viz.trial import Trial
 class TrialTab:
     """Dropdowns of which each offers what the ones above it leave."""
 
-    def __init__(self, gui: viser.GuiApi, catalog: Catalog, first: InferSettings, changed: Changed) -> None:
+    def __init__(self, gui: viser.GuiApi, catalog: Catalog, first: InferSettings, model: str, changed: Changed) -> None:
         self._catalog = catalog
         trial = catalog.dataset(first.dataset).trial(first.split, first.trial)
         self._last = (first.dataset, trial.action)
-        models = catalog.models(first.dataset)
-        checkpoint = catalog.checkpoint(models[0])
+        checkpoint = catalog.checkpoint(model)
         self._dataset = gui.add_dropdown(
             "Dataset", (first.dataset,), hint="Recordings that are on this machine and that a model fits."
         )
-        self._model = gui.add_dropdown("Model", models, hint="Trained models (checkpoints) for this dataset and robot.")
+        self._model = gui.add_dropdown(
+            "Model", (model,), hint="Trained models (checkpoints) that fit dataset and robot."
+        )
         self._action = gui.add_dropdown(
-            "Action", catalog.actions(models[0], first.dataset), initial_value=trial.action,
+            "Action", catalog.actions(model, first.dataset), initial_value=trial.action,
             hint="Kind of interaction; each has its own hidden Markov model.",
         )  # fmt: skip
         self._trial = gui.add_dropdown(
@@ -73,17 +74,11 @@ class TrialTab:
 
     def offer_datasets(self) -> None:
         """List the datasets that can be used, and how to get the others. Reads them: call it when the page stands."""
-        usable = self._catalog.usable_datasets()
+        usable, others = self._catalog.offers()
         offer(self._dataset, usable if self._last[0] in usable else (self._last[0], *usable))
-        lines = [
-            f"{escape(name)}: <code>mild-viz data fetch {escape(name)}</code>" for name in self._catalog.absent()
-        ] + [
-            f"{escape(name)}: no model here fits; <code>mild-viz train --dataset {escape(name)}</code>"
-            for name in self._catalog.present()
-            if name not in usable
-        ]
-        if lines:
-            set_content(self._others, f'<div class="mv-note"><b>Not offered</b><br>{"<br>".join(lines)}</div>')
+        if others:
+            lines = "<br>".join(f"{escape(name)}: {escape(reason)}" for name, reason in others.items())
+            set_content(self._others, f'<div class="mv-note"><b>Datasets not offered</b><br>{lines}</div>')
 
     def show(self, rollout: Rollout) -> None:
         """Say what the variant is and, where it uses the posterior's covariance, whether that can matter here."""

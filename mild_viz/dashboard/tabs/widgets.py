@@ -33,7 +33,7 @@ def number(handle: viser.GuiSliderHandle[float] | viser.GuiSliderHandle[int]) ->
     return clipped
 
 
-def option(handle: viser.GuiDropdownHandle[str]) -> str:
+def option(handle: viser.GuiDropdownHandle[Any]) -> str:
     """A dropdown's value, one of its options; anything else is put back to the first one, with a message."""
     value = str(handle.value)
     if value not in handle.options:
@@ -42,7 +42,7 @@ def option(handle: viser.GuiDropdownHandle[str]) -> str:
     return value
 
 
-def offer(handle: viser.GuiDropdownHandle[str], options: Iterable[str], value: str | None = None) -> None:
+def offer(handle: viser.GuiDropdownHandle[Any], options: Iterable[str], value: str | None = None) -> None:
     """Make these the options (sent only if they differ), and select `value`, or else what was selected, if possible."""
     options = tuple(options)
     keep = handle.value if value is None else value

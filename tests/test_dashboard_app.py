@@ -1,0 +1,151 @@
+"""What is given at the start is checked before a server is opened; what the page offers fits together."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mild_viz import paths
+from mild_viz.checkpoint import RobotInterface, load_checkpoint, save_checkpoint
+from mild_viz.dashboard.app import Dashboard, first_settings, open_dashboard
+from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.server import free_port
+from mild_viz.data.load import load_dataset
+from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel, load_robot
+
+
+def port() -> int:
+    found = free_port("127.0.0.1", 19_300)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return load_robot("pepper")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(paths.default_checkpoint("demo"), tmp_path_factory.mktemp("models") / "demo-copy"))
+
+
+@pytest.fixture(scope="module")
+def dashboard(model: Path) -> Iterator[Dashboard]:
+    dashboard = open_dashboard(checkpoint=model, port=port())
+    assert dashboard.session.wait_idle() and dashboard.session.error is None
+    yield dashboard
+    dashboard.stop()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dataset": "nusi"}, "dataset 'nusi' is unknown; valid: demo, nuisi, yumi, handover"),
+        ({"checkpoint": Path("/nowhere")}, "/nowhere is not a checkpoint"),
+        ({"action": "dance"}, "action 'dance' is unknown; valid: wave, handshake, rocket, parachute"),
+        ({"trial": 4711}, "no handshake trial 4711; valid: 0 to"),
+        ({"trial": -1}, "no handshake trial -1; valid: 0 to"),
+        ({"variant": "v9"}, "variant 'v9' is unknown; valid: v1, v2.1"),
+        ({"robot": "/nowhere.urdf"}, "/nowhere.urdf"),
+        ({"host": "192.0.2.1"}, "no address of this machine"),
+    ],
+)
+def test_unusable_options_are_refused_before_a_server_starts(options: dict[str, Any], message: str) -> None:
+    at = port()
+    with pytest.raises(UserError) as caught:
+        open_dashboard(**{"port": at, **options})
+    assert message in str(caught.value)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", at))
+
+
+def test_a_dataset_that_is_not_here_names_the_command_that_fetches_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MILD_VIZ_DATA", str(tmp_path))
+    with pytest.raises(UserError, match="mild-viz data fetch nuisi"):
+        open_dashboard(dataset="nuisi", port=port())
+
+
+def test_a_checkpoint_for_another_robot_is_refused(tmp_path: Path, model: Path, robot: RobotModel) -> None:
+    checkpoint = load_checkpoint(model)
+    names = ("RShoulderPitch", "RShoulderRoll", "RElbowRoll", "RElbowYaw")
+    other = replace(checkpoint, name="other", robot=RobotInterface("pepper", names, "r_gripper"))
+    save_checkpoint(other, tmp_path / "other", "for a test")
+    catalog = Catalog(robot, tmp_path / "other")
+    assert "drives the joints RShoulderPitch, RShoulderRoll, RElbowRoll, RElbowYaw" in str(
+        catalog.problem("other", "demo")
+    )
+    assert "other" not in catalog.models("demo")
+
+
+def test_a_model_of_two_humans_drives_no_robot(tmp_path: Path, model: Path) -> None:
+    save_checkpoint(replace(load_checkpoint(model), robot=None, robot_vaes={}), tmp_path / "hhi", "for a test")
+    with pytest.raises(UserError, match="human-human model"):
+        open_dashboard(checkpoint=tmp_path / "hhi", port=port())
+
+
+def test_the_first_trial_is_a_test_trial_of_the_action(model: Path) -> None:
+    demo, checkpoint = load_dataset("demo"), load_checkpoint(model)
+    first = first_settings(demo, checkpoint, None, 0, None)
+    trial = demo.trial(first.split, first.trial)
+    assert (first.split, trial.action, first.variant) == ("test", "handshake", "v3.1")
+    n_test = sum(trial.action == "wave" for trial in demo.test)
+    assert first_settings(demo, checkpoint, "wave", n_test, "v1").split == "train"
+
+
+def test_only_what_fits_is_offered(
+    robot: RobotModel, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MILD_VIZ_DATA", str(tmp_path))
+    catalog = Catalog(robot, model)
+    usable, others = catalog.offers()
+    assert usable == ("demo",)
+    assert others["nuisi"] == "get it with: mild-viz data fetch nuisi"
+    assert catalog.models("demo")[0] == "demo-copy", "the model that was asked for comes first"
+    (tmp_path / "nuisi").mkdir()
+    (tmp_path / "nuisi" / "traj_data.npz").write_bytes(b"PK not a recording")
+    usable, others = Catalog(robot, model).offers()
+    assert usable == ("demo",) and "traj_data.npz" in others["nuisi"], "a broken file is named, and breaks nothing"
+
+
+def test_real_recordings_come_with_the_model_made_for_them(robot: RobotModel, dataset: Callable[[str], Any]) -> None:
+    dataset("nuisi")
+    catalog = Catalog(robot, paths.default_checkpoint("demo"))
+    assert catalog.models("nuisi")[0] == "nuisi-pepper" and catalog.models("demo")[0] == "demo"
+    assert "nuisi" in catalog.offers()[0]
+    dataset("yumi")
+    assert catalog.models("yumi") == () and "recorded the joints" in str(catalog.problem("demo", "yumi"))
+
+
+def test_switching_the_dataset_brings_its_model_actions_and_trials(
+    dashboard: Dashboard, dataset: Callable[[str], Any]
+) -> None:
+    dataset("nuisi")
+    dropdown, session = dashboard.controls._trial._dataset, dashboard.session
+    dashboard.controls.offer_datasets()
+    dropdown.value = "nuisi"
+    session.mark_dirty()
+    assert session.wait_idle() and session.choice is not None
+    assert session.error is None
+    assert session.choice.trial.dataset == "nuisi" and session.choice.checkpoint.name == "nuisi-pepper"
+    dropdown.value = "demo"
+    session.mark_dirty()
+    assert session.wait_idle() and session.choice.trial.dataset == "demo"
+
+
+def test_contact_states_that_cannot_be_saved_say_so(dashboard: Dashboard, model: Path) -> None:
+    (model / "contact_states.json").unlink(missing_ok=True)
+    (model / "contact_states.json").mkdir()  # a place where no file can be put, for any account
+    dashboard.controls._save_contact_states()
+    assert "Not saved" in dashboard.controls._states._saved.content
+    assert "cannot be written" in dashboard.controls._states._saved.content
+    (model / "contact_states.json").rmdir()
