@@ -15,7 +15,7 @@ from scene_rollouts import N_STATES, scene_inference, scene_rollout, without_tru
 from mild_viz.dashboard.recorder import private_server
 from mild_viz.dashboard.scene.figure import make_figure
 from mild_viz.dashboard.scene.latent import OPACITY_FLOOR, OPACITY_RANGE, TEXT_SIZE, dashed, segments, spread
-from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, Camera
+from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, PLOT_TURN, Camera
 from mild_viz.dashboard.scene.palette import DARK, LIGHT, linear, state_color
 from mild_viz.dashboard.scene.projection import LARGEST_RADIUS, make_projection, nice_step
 from mild_viz.dashboard.scene.scene import Scene
@@ -431,9 +431,14 @@ def test_dashes_cover_half_of_the_line() -> None:
 
 
 def test_state_names_do_not_overlap() -> None:
-    spots = spread(np.zeros((8, 3)))
-    assert np.abs(spots).max() < 4 * max(TEXT_SIZE)
-    assert np.unique(np.round(spots, 3), axis=0).shape[0] == 8
+    spots = spread(0.05 * np.random.default_rng(2).normal(size=(12, 3)))
+    turn = -PLOT_TURN
+    across, high = spots @ [np.cos(turn), np.sin(turn), 0.0], spots[:, 2]
+    wide, tall = (np.abs(values[:, None] - values[None]) for values in (across, high))
+    overlap = (wide < 0.9 * TEXT_SIZE[0]) & (tall < 0.9 * TEXT_SIZE[1])
+    assert overlap.sum() == len(spots), "only with themselves"
+    assert np.abs(spots).max() < 0.5 * PLOT_SIZE
+    assert len(np.unique(np.round(spread(np.zeros((8, 3))), 3), axis=0)) == 8, "equal places part too"
 
 
 def test_quaternions_of_half_turns_are_right() -> None:

@@ -106,7 +106,7 @@ class HumanView:
         self._lost.position = crown + [0.0, 0.0, 0.26]
         self._unobserved.position = middle + [-0.04, 0.14 * height, (-0.45 if figure.whole else -0.24) * height]
         self._unobserved.visible = figure.soles is None
-        self._caption.text = "the model sees the red arm" if figure.whole else "right arm observed"
+        self._caption.text = "red arm: model input" if figure.whole else "right arm observed"
         if "left_arm" in self._schematic:
             self._schematic["left_arm"].position = middle
 

@@ -27,7 +27,7 @@ DASH = 0.022
 OPACITY_FLOOR, OPACITY_RANGE = 0.16, 0.56
 """An inactive state stays findable; a fully active one still shows what is inside it."""
 
-TEXT_SIZE = (0.085, 0.072)
+TEXT_SIZE = (0.10, 0.085)
 """Room that a state's name takes on a small screen [m]."""
 
 AGENTS = ("human", "robot")
@@ -147,8 +147,8 @@ class LatentView:
         tints = {"human": colors.human, "truth": colors.robot, "prediction": colors.prediction}
         self._trails = {}
         for name in TRACES:
-            faint = colors.faint(tints[name], 0.6)
-            self._line(f"path_{name}", frames.lines[name], solid_color(faint, len(frames.lines[name])), 1.6)
+            faint = colors.faint(tints[name], 0.5)
+            self._line(f"path_{name}", frames.lines[name], solid_color(faint, len(frames.lines[name])), 1.4)
             fade = np.linspace(0.35, 1.0, TRAIL + 1)
             shades = np.array([colors.faint(tints[name], float(share)) for share in fade], dtype=np.uint8)
             self._trails[name] = self._line(
@@ -218,7 +218,7 @@ def filled(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     return points[np.where(last < 0, seen.argmax(), last)]
 
 
-def spread(spots: Float[np.ndarray, "K 3"], steps: int = 60) -> Float[np.ndarray, "K 3"]:
+def spread(spots: Float[np.ndarray, "K 3"], steps: int = 150) -> Float[np.ndarray, "K 3"]:
     """Push texts apart that would overlap as seen from the dyad's viewer, within the plane of the picture."""
     right, up = np.array([np.cos(-PLOT_TURN), np.sin(-PLOT_TURN), 0.0]), np.array([0.0, 0.0, 1.0])
     spots = spots.copy()

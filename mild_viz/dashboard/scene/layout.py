@@ -12,7 +12,7 @@ from mild_viz.settings import choose
 CAMERAS = ("both", "participant", "experimenter", "latent")
 """Camera presets: all three groups; over the human's shoulder; from the side of the dyad; the latent plot."""
 
-PLOT_SIZE = 1.1
+PLOT_SIZE = 1.3
 """Edge of the latent plot's box [m]."""
 
 PLOT_TURN = -np.radians(28.0)
@@ -21,7 +21,7 @@ PLOT_TURN = -np.radians(28.0)
 FIELD_OF_VIEW = np.radians(28.0)
 """Vertical field of view: narrow, so that figures at the sides of the picture do not lean outwards."""
 
-WIDEST = 1.75
+WIDEST = 1.85
 """Width over height of a canvas that just shows all three groups; one that is wider needs no more distance."""
 
 Vector = Float[np.ndarray, " 3"]
@@ -75,8 +75,8 @@ def make_layout(
     away = T_world_human[:3, 3] * [1.0, 1.0, 0.0]
     distance = float(np.linalg.norm(away))
     forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
-    centre = forward * (max(distance, 0.75) + 1.15)
-    centre[2] = floor + 1.02
+    centre = forward * (max(distance, 0.75) + 1.25)
+    centre[2] = floor + 0.98
     yaw = float(np.arctan2(forward[1], forward[0])) + PLOT_TURN
     return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
 
@@ -87,7 +87,7 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
     floor, up = layout.floor, np.array([0.0, 0.0, 1.0])
     if name == "participant":
         behind = layout.human_eye + 0.80 * layout.forward + 0.62 * layout.side + 0.30 * up
-        return pinhole(behind, 0.4 * layout.robot_top + 0.6 * layout.hand, np.radians(48.0))
+        return pinhole(behind, 0.4 * layout.robot_top + 0.6 * layout.hand, np.radians(38.0))
     plot = [
         layout.plot_centre + PLOT_SIZE * (0.74 * a * layout.forward + 0.6 * b * layout.side + 0.5 * c * up)
         for a in (-1, 1)

@@ -18,8 +18,8 @@ ROOT = "/robot"
 
 GHOST_OPACITY = 0.45
 
-GHOST_FROM = 0.004
-"""Nearer than this [m] to the command the ghost is left out: it would only flicker inside the solid arm."""
+GHOST_FROM = 0.015
+"""Nearer than this [m] to the command the ghost is left out: it would only veil the solid arm."""
 
 
 @dataclass(frozen=True, eq=False)
