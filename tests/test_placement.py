@@ -104,7 +104,7 @@ def test_suggested_contact_states():
     assert suggest_contact_states(active, touching, 5) == {1, 2}
     assert suggest_contact_states(active, [t & False for t in touching], 5) == frozenset()
     rare = [np.array([1, 0, 0, 0, 0, 0, 0], bool), np.zeros(5, bool)]
-    assert suggest_contact_states(active, rare, 5) == {0}
+    assert suggest_contact_states(active, rare, 5) == {0}, "relative to the state with the largest share"
 
 
 # the estimate

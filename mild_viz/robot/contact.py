@@ -22,6 +22,9 @@ TOGETHER = 0.5
 CLOSE = 0.05
 """Where both are in one frame: hands in contact are this much above their smallest distance at most [m]."""
 
+RELATIVE_SHARE = 0.5
+"""A contact state has at least this part of the largest share of frames in contact that any state has."""
+
 
 def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     """Frames in which the partners' right hands touch; none where the action is without contact.
@@ -57,19 +60,17 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
 def suggest_contact_states(
     active: Sequence[Int[np.ndarray, "_"]], touching: Sequence[Bool[np.ndarray, "_"]], n_states: int
 ) -> frozenset[int]:
-    """HMM states in which the partners touch in most frames, from the segments of several trials.
+    """HMM states in which the partners touch, from the segments of several trials.
 
     `active` holds the active state of every window, `touching` whether there is contact at the newest
-    observation of that window (`contact_frames(trial)[4 : 4 + N]`). Where no state has a majority, the
-    one with the largest share is taken, if the partners touch at all.
+    observation of that window (`contact_frames(trial)[4 : 4 + N]`). Chosen are the states whose share of
+    frames with contact is at least half of the largest state's share: relative, because the rule for contact
+    frames leaves out those in which the hands move fast or back.
     """
     states, contact = np.concatenate(active), np.concatenate(touching)
-    if not contact.any():
-        return frozenset()
     visits = np.bincount(states, minlength=n_states)
     share = np.bincount(states, weights=contact, minlength=n_states) / np.maximum(visits, 1)
-    chosen = frozenset(int(state) for state in np.flatnonzero(share >= 0.5))
-    return chosen or frozenset({int(np.argmax(share))})
+    return frozenset(int(state) for state in np.flatnonzero((share >= RELATIVE_SHARE * share.max()) & (share > 0.0)))
 
 
 def arm_length(arm: Float[np.ndarray, "T 3 3"]) -> float:
