@@ -65,7 +65,7 @@ def test_alpha_follows_the_chosen_mode() -> None:
     lanes = {mode: charts.draw_lanes(make_rollout(inference), mode)["alpha"] for mode in ("human", "unobserved")}
     lines = list(parse(lanes["unobserved"]).iter("polyline"))
     assert [line.get("style") for line in lines] == [f"stroke:{color}" for color in STATE_COLORS[:3]]
-    assert points(lines[2])[:, 1] == pytest.approx((1.03 - 0.5) / 1.06 * 100, abs=0.06)
+    assert points(lines[2])[:, 1] == pytest.approx((1.03 - 0.5) / 1.06 * charts.HEIGHT, abs=0.6)
     assert lanes["human"] != lanes["unobserved"] and ">unobserved<" in lanes["unobserved"]
 
 

@@ -7,16 +7,18 @@ variables, so that a change of theme redraws nothing. Nothing is computed here: 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from html import escape
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mild_viz.rollout import Rollout
+from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import STATE_COLORS
 from mild_viz.trial import PHASES
 
-WIDTH, HEIGHT = 1000, 100
+WIDTH, HEIGHT = 1000, 1000
+"""Of a picture, in its own units: it is stretched to the lane."""
 LANES = ("states", "alpha", "joints", "distance", "axis")
 MAX_POINTS = 600
 PHASE_COLORS = tuple(
@@ -40,10 +42,10 @@ def draw_lanes(rollout: Rollout, alpha_mode: str) -> dict[str, str]:
     """One snippet of HTML for each of `LANES`."""
     return {
         "states": _states(rollout),
-        "alpha": _alpha(rollout, alpha_mode),
+        "alpha": _alpha(rollout.inference, alpha_mode),
         "joints": _joints(rollout),
         "distance": _distance(rollout),
-        "axis": _axis(rollout),
+        "axis": _axis(rollout.inference),
     }
 
 
@@ -66,21 +68,19 @@ def _span(start: int, end: int, n_rows: int) -> tuple[float, float]:
     return 100.0 * left, 100.0 * (right - left)
 
 
-def _line(
-    values: Float[np.ndarray, " N"], low: float, high: float, css: str = "", color: str = "", top: float = 0.0,
-    height: float = HEIGHT,
-) -> str:  # fmt: skip
-    """A polyline of one curve, broken where it is NaN; `low`..`high` fills `height` from `top`."""
+def _line(values: Float[np.ndarray, " N"], low: float, high: float, css: str = "", color: str = "") -> str:
+    """A polyline of one curve, broken where it is NaN; `low`..`high` fills the height."""
     rows = np.arange(len(values))
     step = -(-len(values) // MAX_POINTS)
     rows = np.unique(np.append(rows[::step], rows[-1]))
     x = rows * (WIDTH / max(len(values) - 1, 1))
-    y = top + height * (1.0 - (values[rows] - low) / max(high - low, 1e-9))
+    y = HEIGHT * (1.0 - (values[rows] - low) / max(high - low, 1e-9))
     style = f' class="{css}"' if css else f' style="stroke:{color}"'
     lines = []
     for start, end, valid in runs(np.isfinite(y)):
         if valid:
-            points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(x[start:end], y[start:end], strict=True))
+            pairs = np.stack([x[start:end], y[start:end]], axis=1).round().astype(int).tolist()
+            points = " ".join([f"{a},{b}" for a, b in pairs])
             lines.append(f'<polyline{style} points="{points}"/>')
     return "".join(lines)
 
@@ -143,11 +143,11 @@ def _states(rollout: Rollout) -> str:
     return _lane("Active state", note, plot, css=css)
 
 
-def _alpha(rollout: Rollout, mode: str) -> str:
-    inference = rollout.inference
+@lru_cache(maxsize=8)  # a control-only rerun keeps the inference
+def _alpha(inference: Inference, mode: str) -> str:
     alpha = np.exp(inference.log_alpha(mode))
     lines = "".join(_line(alpha[:, s], -0.03, 1.03, color=state_color(s)) for s in range(inference.n_states))
-    plot = _svg(_grid(rollout) + _bands(~inference.observed, "mv-lost") + lines)
+    plot = _svg(_grid(inference) + _bands(~inference.observed, "mv-lost") + lines)
     note = escape(mode) if inference.observed.all() else f"{escape(mode)} · grey: lost"
     return _lane("Forward variable", note, plot, ("1", "0"))
 
@@ -157,6 +157,7 @@ def _joints(rollout: Rollout) -> str:
     inference = rollout.inference
     degrees = [np.degrees(x) for x in (inference.joints_truth, inference.joints_decoded, rollout.joints_commanded)]
     n_joints = len(inference.joint_names)
+    background = _grid(inference) + _bands(rollout.contact, "mv-touch")
     rows = []
     for j, name in enumerate(inference.joint_names):
         curves = [values[:, j] for values in degrees]
@@ -167,7 +168,7 @@ def _joints(rollout: Rollout) -> str:
             _line(values, low - margin, high + margin, css)
             for values, css in zip(curves, ("mv-truth", "mv-decoded", "mv-commanded"), strict=True)
         )
-        plot = _svg(_grid(rollout) + _bands(rollout.contact, "mv-touch") + content)
+        plot = _svg(background + content)
         span = f"{low:.0f} to {high:.0f}°"
         rows.append(
             f'<div class="mv-row" style="height:{100 / n_joints:.3f}%"><div class="mv-name">{escape(name)}</div>'
@@ -186,7 +187,9 @@ def _distance(rollout: Rollout) -> str:
     known = centimetres[np.isfinite(centimetres)]
     high = float(known.max()) if len(known) else 1.0
     plot = _svg(
-        _grid(rollout) + _bands(rollout.contact, "mv-touch") + _line(centimetres, 0.0, 1.06 * high, "mv-commanded")
+        _grid(rollout.inference)
+        + _bands(rollout.contact, "mv-touch")
+        + _line(centimetres, 0.0, 1.06 * high, "mv-commanded")
     )
     return _lane("Hand distance", "robot to human", plot, (f"{high:.0f} cm", "0"))
 
@@ -199,19 +202,21 @@ def tick_times(start: float, end: float) -> list[float]:
     return [i * step for i in range(first, int(np.floor(end / step + 1e-9)) + 1)]
 
 
-def _ticks(rollout: Rollout) -> list[tuple[float, float]]:
+def _ticks(inference: Inference) -> list[tuple[float, float]]:
     """The marks of the time axis: (time [s], fraction of the width)."""
-    start, end = float(rollout.inference.time[0]), float(rollout.inference.time[-1])
+    start, end = float(inference.time[0]), float(inference.time[-1])
     return [(t, (t - start) / max(end - start, 1e-9)) for t in tick_times(start, end)]
 
 
-def _grid(rollout: Rollout) -> str:
-    lines = (f'<line x1="{WIDTH * f:.0f}" x2="{WIDTH * f:.0f}" y1="0" y2="{HEIGHT}"/>' for _, f in _ticks(rollout))
+@lru_cache(maxsize=8)
+def _grid(inference: Inference) -> str:
+    lines = (f'<line x1="{WIDTH * f:.0f}" x2="{WIDTH * f:.0f}" y1="0" y2="{HEIGHT}"/>' for _, f in _ticks(inference))
     return f'<g class="mv-grid">{"".join(lines)}</g>'
 
 
-def _axis(rollout: Rollout) -> str:
-    marks = "".join(f'<span style="left:{100 * f:.2f}%">{t:g}</span>' for t, f in _ticks(rollout))
+@lru_cache(maxsize=8)
+def _axis(inference: Inference) -> str:
+    marks = "".join(f'<span style="left:{100 * f:.2f}%">{t:g}</span>' for t, f in _ticks(inference))
     return (
         '<div class="mv-lane mv-axis"><div class="mv-name"><small>time [s]</small></div>'
         f'<div class="mv-plot">{marks}</div><div class="mv-range"></div></div>'
