@@ -15,10 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from mild_viz.errors import UserError
 from mild_viz.robot import chain as chain_module
+from mild_viz.robot.chain import load_chain
 from mild_viz.robot.ik import forward, jacobian
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.robots import PEPPER_JOINTS, PEPPER_REST
 from mild_viz.robot.visuals import resolve_file
+from mild_viz.trial import ACTIONS
 
 REFERENCES = ["robots/pepper_naoqi/pepper.urdf", "robots/pepper_description/urdf/pepper.urdf"]
 
@@ -153,6 +155,37 @@ def test_links_that_do_not_move_keep_their_pose():
     for column, name in enumerate(robot.link_names):
         spread = np.abs(poses[:, column] - poses[0, column]).max()
         assert (spread > 1e-3) == (name in robot.moving_links), name
+
+
+def test_hand_of_an_action_turns_without_moving_the_end_effector(shared):
+    for name in ("pepper", str(shared(REFERENCES[0]))):
+        robot = load_robot(name)
+        joints = random_joints(robot, 10)
+        plain = dict(zip(robot.link_names, robot.link_poses(joints).swapaxes(0, 1), strict=True))
+        for action in ACTIONS:
+            poses = robot.link_poses(joints, action)
+            for column, link in enumerate(robot.link_names):
+                hand = link == "r_wrist" or link.startswith(("RFinger", "RThumb"))
+                changed = np.abs(poses[:, column] - plain[link]).max() > 1e-9
+                # the forearm and everything else stay; every action has a wrist or fingers of its own
+                assert not changed or hand, (action, link)
+            chain = load_chain(robot.description, PEPPER_JOINTS, "r_gripper", robot.rest | robot.hands[action])
+            np.testing.assert_allclose(forward(chain, joints), robot.end_effector(joints), atol=1e-9)
+
+
+def test_palm_forward_in_a_wave_and_thumb_up_in_a_handshake(shared):
+    robot = load_robot(str(shared(REFERENCES[0])))
+
+    def thumb_and_palm(joints: list[float], action: str) -> tuple[np.ndarray, np.ndarray]:
+        poses = dict(zip(robot.link_names, robot.link_poses(np.array([joints]), action)[0, :, 4:], strict=True))
+        fingers, thumb = poses["RFinger21_link"] - poses["r_wrist"], poses["RThumb1_link"] - poses["r_wrist"]
+        fingers = fingers / np.linalg.norm(fingers)
+        thumb = thumb - fingers * (thumb @ fingers)
+        thumb = thumb / np.linalg.norm(thumb)
+        return thumb, np.cross(thumb, fingers)
+
+    assert thumb_and_palm([1.0, -0.05, 0.7, 0.97], "handshake")[0][2] > 0.95
+    assert thumb_and_palm([0.3, -0.4, 1.6, 1.5], "wave")[1][0] > 0.5
 
 
 def test_mimic_prismatic_and_normalised_axis(small_arm):

@@ -31,6 +31,8 @@ class RobotModel:
     tree: LinkTree
     rest: dict[str, float]
     """Where the joints rest [rad]; those not named at 0."""
+    hands: dict[str, dict[str, float]]
+    """Where the joints of the hand stand instead during each action [rad]."""
     description: Description
 
     @property
@@ -65,10 +67,21 @@ class RobotModel:
         poses = dict(zip(self.link_names, self.tree.resting, strict=True))
         return min((_lowest(mesh, poses[name]) for name, mesh in self.visuals.items()), default=0.0)
 
-    def link_poses(self, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N L 7"]:
-        """Pose of every drawn link in the base frame (wxyz, xyz [m]) at N joint vectors [rad]."""
+    def link_poses(self, joints: Float[np.ndarray, "N J"], action: str | None = None) -> Float[np.ndarray, "N L 7"]:
+        """Pose of every drawn link in the base frame (wxyz, xyz [m]) at N joint vectors [rad].
+
+        With an action, the hand has the posture of that action; the end effector is where it is without.
+        """
         self._check(joints)
-        return self.tree.poses(joints)
+        tree = self.tree if action is None else self._trees.get(action, self.tree)
+        return tree.poses(joints)
+
+    @cached_property
+    def _trees(self) -> dict[str, LinkTree]:
+        return {
+            action: build_tree(self.description, self.chain.joint_names, self.rest | hand, self.link_names)
+            for action, hand in self.hands.items()
+        }
 
     def end_effector(self, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N 3"]:
         """Position of the end effector in the base frame [m] at N joint vectors [rad]."""
@@ -102,4 +115,4 @@ def load_robot(
     description = read_description(path)
     chain = load_chain(description, joint_names, end_effector or known.end_effector, known.rest)
     tree = build_tree(description, joint_names, known.rest, drawn_links(description))
-    return RobotModel(name, chain, tree, known.rest, description)
+    return RobotModel(name, chain, tree, known.rest, known.hands, description)

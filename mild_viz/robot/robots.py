@@ -16,14 +16,29 @@ PEPPER_REST = {
     "RShoulderRoll": -0.12,
     "RElbowYaw": 1.2,
     "RElbowRoll": 0.5,
+    "RWristYaw": 0.8,
     "RHand": 0.5,
     "LShoulderPitch": 1.5,
     "LShoulderRoll": 0.12,
     "LElbowYaw": -1.2,
     "LElbowRoll": -0.5,
+    "LWristYaw": -0.8,
     "LHand": 0.5,
 }
-"""Standing with both arms hanging and the hands half closed [rad]; joints not named here are at 0."""
+"""Standing with both arms hanging, palms inward, hands half closed [rad]; joints not named here are at 0."""
+
+PEPPER_HANDS = {
+    "wave": {"RWristYaw": 0.0, "RHand": 0.98},
+    "handshake": {"RWristYaw": 1.2, "RHand": 0.75},
+    "rocket": {"RWristYaw": 0.8, "RHand": 0.02},
+    "parachute": {"RWristYaw": 1.2, "RHand": 0.02},
+    "handover": {"RWristYaw": 1.2, "RHand": 0.75},
+}
+"""The fixed hand of each interaction (Sec. IK adaptation: "a fixed value for the wrist for each interaction").
+
+The values are ours: the palm looks forward in a wave, the thumb up in a handshake, the hand is a fist in a bump.
+Pepper's end effector lies on the wrist's axis, so that none of them moves it.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,10 +50,12 @@ class KnownRobot:
     joint_names: tuple[str, ...]
     end_effector: str
     rest: dict[str, float] = field(default_factory=dict)
+    hands: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Per action, where joints beyond the controlled ones stand [rad]; they must not move the end effector."""
 
 
 ROBOTS: dict[str, KnownRobot] = {
-    "pepper": KnownRobot("pepper/pepper.urdf", PEPPER_JOINTS, "r_gripper", PEPPER_REST),
+    "pepper": KnownRobot("pepper/pepper.urdf", PEPPER_JOINTS, "r_gripper", PEPPER_REST, PEPPER_HANDS),
 }
 
 
