@@ -108,19 +108,19 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
 
     Returns the new carry, and the command for the next frame: None until five observations were taken.
     """
-    carry = _observe(model, carry, arm)
-    if carry.n_frames < WINDOW:
-        return carry, None
-    window = carry.features.reshape(1, -1)
+    seen = _observe(model, carry, arm)
+    if seen.n_frames < WINDOW:
+        return seen, None
+    window = seen.features.reshape(1, -1)
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     mean, std = model.human_vae.encode(window)
-    log_alpha, _ = forward_filter(model.human_hmm, log_emission(model.human_hmm, mean), carry.log_alpha)
+    log_alpha, _ = forward_filter(model.human_hmm, log_emission(model.human_hmm, mean), seen.log_alpha)
     latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
     decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
-    hand = np.full(3, np.nan) if carry.previous is None else carry.previous[6:9]
+    hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     target = in_frame(model.T_world_human, hand[None])
-    result = run_controller(model.robot.chain, model.settings, model.action, log_alpha, decoded, target, carry.control)
+    result = run_controller(model.robot.chain, model.settings, model.action, log_alpha, decoded, target, seen.control)
     command = Command(
         log_alpha=log_alpha[0],
         active_state=int(log_alpha[0].argmax()),
@@ -132,7 +132,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
         contact=bool(result.contact[0]),
         stiffness=result.stiffness[0],
     )
-    return carry._replace(log_alpha=log_alpha[0], control=result.carry), command
+    return seen._replace(log_alpha=log_alpha[0], control=result.carry), command
 
 
 def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
@@ -146,6 +146,4 @@ def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) ->
     position = filled.reshape(9)
     velocity = np.zeros(9) if carry.previous is None else position - carry.previous
     features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return carry._replace(
-        features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=position
-    )
+    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.log_alpha, carry.control)

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def fit_ridge(train: Examples, strength: float) -> Predictor:
 
 def fit_nearest(train: Examples, neighbours: int) -> Predictor:
     """The mean partner window of the nearest human windows (k-nearest neighbours, Euclidean)."""
-    tree = cKDTree(train.human)
+    tree = KDTree(train.human)
     k = min(neighbours, len(train.human))
 
     def predict(test: Examples) -> np.ndarray:

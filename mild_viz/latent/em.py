@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.latent import kernels
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows, safe_log
+from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows
 
 TRANSITION_FLOOR = 1e-6
 """Smallest transition probability: a state that was never left can still be left."""
@@ -52,7 +52,6 @@ def em_step(
     `floor` is added to the diagonal of every covariance (the paper's regularisation), once an iteration.
     """
     n_states, size = hmm.emission_means.shape
-    log_transition = safe_log(hmm.transition_matrix)
     stacked = np.concatenate(sequences)
     likelihood = log_emission(hmm, stacked)
     gamma = np.empty((len(stacked), n_states))
@@ -63,8 +62,8 @@ def em_step(
         rows = slice(start, start + len(sequence))
         log_alpha, log_probability = forward_filter(hmm, likelihood[rows])
         log_beta = np.empty_like(log_alpha)
-        kernels.backward(log_transition, likelihood[rows], log_beta)
-        kernels.add_transition_counts(log_alpha, log_beta, log_transition, likelihood[rows], counts)
+        kernels.backward(hmm.log_transition, likelihood[rows], log_beta)
+        kernels.add_transition_counts(log_alpha, log_beta, hmm.log_transition, likelihood[rows], counts)
         log_gamma = log_alpha + log_beta
         log_gamma -= log_gamma.max(1, keepdims=True)
         weights = np.exp(log_gamma)

@@ -2,10 +2,34 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
-from mild_viz.latent.hmm import HMM
+from mild_viz.latent.hmm import HMM, observed_rows
+
+
+class Regression(NamedTuple):
+    """What conditioning without a posterior covariance needs of a model: it does not depend on the observation."""
+
+    gain: Float[np.ndarray, "S R H"]
+    """K_i of Eq. gmr-conditioning-K-i."""
+    offset: Float[np.ndarray, "S R"]
+    """Such that the conditional mean of state i is offset_i + K_i z."""
+    covariance: Float[np.ndarray, "S R R"]
+    """Sigma^rr_i - K_i Sigma^hr_i."""
+
+
+@lru_cache(maxsize=64)  # a stream conditions the same model on one observation after the other
+def regression(hmm: HMM, size: int) -> Regression:
+    """The regression of the robot's latent dimensions on the first `size`, the human's, for every state."""
+    cov_rh = hmm.emission_covariances[:, size:, :size]
+    cov_hr = cov_rh.transpose(0, 2, 1)
+    gain = np.linalg.solve(hmm.emission_covariances[:, :size, :size], cov_hr).transpose(0, 2, 1)
+    offset = hmm.emission_means[:, size:] - (gain @ hmm.emission_means[:, :size, None])[..., 0]
+    return Regression(gain, offset, hmm.emission_covariances[:, size:, size:] - gain @ cov_hr)
 
 
 def condition(
@@ -22,35 +46,41 @@ def condition(
     own Gaussians remains.
     """
     size = human_mean.shape[1]
-    mean_h, mean_r = hmm.emission_means[:, :size], hmm.emission_means[:, size:]
-    cov_hh = hmm.emission_covariances[:, :size, :size]
-    cov_rh = hmm.emission_covariances[:, size:, :size]
-    cov_rr = hmm.emission_covariances[:, size:, size:]
-    observed = ~np.isnan(human_mean).any(1)
     weights = np.exp(log_alpha)
-    deviation = np.where(observed[:, None, None], human_mean[:, None, :] - mean_h, 0.0)  # N S H
-
+    seen = observed_rows(human_mean)
     if human_std is None:
-        gain = np.linalg.solve(cov_hh, cov_rh.transpose(0, 2, 1)).transpose(0, 2, 1)  # S R H
-        means = mean_r + np.einsum("srh,nsh->nsr", gain, deviation)
-        reduction = gain @ cov_rh.transpose(0, 2, 1)
-        within = np.einsum("ns,sab->nab", weights, cov_rr)
-        within -= np.einsum("ns,sab->nab", weights * observed[:, None], reduction)
+        gain, offset, covariances = regression(hmm, size)
+        means = (human_mean @ gain.reshape(-1, size).T).reshape(-1, *offset.shape) + offset
+        within = _mix(weights, covariances)
     else:
-        posterior = np.zeros((len(human_mean), 1, size, size))
-        posterior[:, 0, range(size), range(size)] = np.where(observed[:, None], human_std, 0.0) ** 2
-        gain = np.linalg.solve(
-            cov_hh + posterior,
-            np.broadcast_to(cov_rh.transpose(0, 2, 1), (len(human_mean), *cov_rh.transpose(0, 2, 1).shape)),
-        )
-        gain = gain.transpose(0, 1, 3, 2)  # N S R H
-        means = mean_r + (gain @ deviation[..., None])[..., 0]
-        reduction = (gain @ cov_rh.transpose(0, 2, 1)) * observed[:, None, None, None]
-        within = np.einsum("ns,nsab->nab", weights, cov_rr - reduction)
-
-    mean = np.einsum("ns,nsr->nr", weights, means)
+        means, covariances = _condition_on_posterior(hmm, human_mean, human_std)
+        within = (weights[:, None, :] @ covariances.reshape(*weights.shape, -1)).reshape(covariances[:, 0].shape)
+    if not seen.all():
+        means[~seen] = hmm.emission_means[:, size:]
+        within[~seen] = _mix(weights[~seen], hmm.emission_covariances[:, size:, size:])
+    mean = (weights[:, None, :] @ means)[:, 0]
     # Eq. gmr-conditioning-sigma-t, with the spread of the means taken about their mixture mean: the same
     # number as the difference of second moments, without its cancellation.
     spread = means - mean[:, None, :]
-    covariance = within + np.einsum("ns,nsa,nsb->nab", weights, spread, spread)
+    covariance = within + (weights[..., None] * spread).transpose(0, 2, 1) @ spread
     return mean, 0.5 * (covariance + covariance.transpose(0, 2, 1))
+
+
+def _condition_on_posterior(
+    hmm: HMM, human_mean: Float[np.ndarray, "N H"], human_std: Float[np.ndarray, "N H"]
+) -> tuple[Float[np.ndarray, "N S R"], Float[np.ndarray, "N S R R"]]:
+    """Conditional mean and covariance of every state (Eqs. conditioning-withcov-K-i and -mu-i); NaN where not seen."""
+    size = human_mean.shape[1]
+    mean_h, mean_r = hmm.emission_means[:, :size], hmm.emission_means[:, size:]
+    cov_rh = hmm.emission_covariances[:, size:, :size]
+    cov_hr = cov_rh.transpose(0, 2, 1)
+    posterior = human_std[:, None, :, None] ** 2 * np.eye(size)
+    innovation = hmm.emission_covariances[:, :size, :size] + posterior  # N S H H
+    gain = np.linalg.solve(innovation, np.broadcast_to(cov_hr, (len(human_mean), *cov_hr.shape))).swapaxes(2, 3)
+    means = mean_r + (gain @ (human_mean[:, None, :] - mean_h)[..., None])[..., 0]
+    return means, hmm.emission_covariances[:, size:, size:] - gain @ cov_hr
+
+
+def _mix(weights: Float[np.ndarray, "N S"], covariances: Float[np.ndarray, "S R R"]) -> Float[np.ndarray, "N R R"]:
+    """Weighted sums of the states' covariances."""
+    return (weights @ covariances.reshape(len(covariances), -1)).reshape(-1, *covariances.shape[1:])

@@ -40,6 +40,10 @@ class HMM:
         return len(self.initial_probs)
 
     @cached_property
+    def log_transition(self) -> Float[np.ndarray, "S S"]:
+        return safe_log(self.transition_matrix)
+
+    @cached_property
     def whitening(self) -> tuple[Float[np.ndarray, "S D D"], Float[np.ndarray, "S D"], Float[np.ndarray, " S"]]:
         """Per state W, b, c such that log N(z; mu, Sigma) = c - |W z - b|^2 / 2."""
         factors = np.linalg.cholesky(self.emission_covariances)
@@ -72,6 +76,11 @@ def check_hmm(hmm: HMM, where: str) -> HMM:
     return hmm
 
 
+def observed_rows(z: Float[np.ndarray, "N D"]) -> Bool[np.ndarray, " N"]:
+    """True where a step has an observation."""
+    return np.logical_and.reduce(np.isfinite(z), axis=1)
+
+
 def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N S"]:
     """log N(z_n; mu_i, Sigma_i). A row of `z` with NaN is a missing observation and gives a row of zeros."""
     inverse, offsets, constants = hmm.whitening
@@ -79,7 +88,8 @@ def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N 
     n_states, size, _ = inverse.shape
     whitened = (z @ inverse.reshape(n_states * size, size).T).reshape(-1, n_states, size) - offsets
     log_density = constants - 0.5 * (whitened**2).sum(2)
-    return np.where(np.isnan(z).any(1)[:, None], 0.0, log_density)
+    log_density[~observed_rows(z)] = 0.0
+    return log_density
 
 
 def forward_filter(
@@ -93,7 +103,7 @@ def forward_filter(
     `log_likelihood` is a step without an observation; all rows zero give the unobserved forward variable
     of Eq. vaeHMM-prior.
     """
-    log_transition = safe_log(hmm.transition_matrix)
+    log_transition = hmm.log_transition
     if previous is None:
         log_prior = safe_log(hmm.initial_probs)
     else:
@@ -112,7 +122,7 @@ def smooth(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarr
     """log p(state at n given z_{1:N}), by forward-backward."""
     log_alpha, _ = forward_filter(hmm, log_likelihood)
     log_beta = np.empty_like(log_alpha)
-    kernels.backward(safe_log(hmm.transition_matrix), np.ascontiguousarray(log_likelihood), log_beta)
+    kernels.backward(hmm.log_transition, np.ascontiguousarray(log_likelihood), log_beta)
     log_gamma = log_alpha + log_beta
     return log_gamma - np.logaddexp.reduce(log_gamma, axis=1, keepdims=True)
 
@@ -120,12 +130,5 @@ def smooth(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarr
 def viterbi_path(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
     """Most likely state sequence, and its joint log probability with the observations."""
     path = np.empty(len(log_likelihood), dtype=np.int64)
-    score = kernels.viterbi(
-        safe_log(hmm.initial_probs), safe_log(hmm.transition_matrix), np.ascontiguousarray(log_likelihood), path
-    )
+    score = kernels.viterbi(safe_log(hmm.initial_probs), hmm.log_transition, np.ascontiguousarray(log_likelihood), path)
     return path, float(score)
-
-
-def observed_rows(z: Float[np.ndarray, "N D"]) -> Bool[np.ndarray, " N"]:
-    """True where a step has an observation."""
-    return ~np.isnan(z).any(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -40,8 +41,17 @@ class VAE:
     def latent_size(self) -> int:
         return self.weights["posterior_mean.weight"].shape[0]
 
+    @cached_property
+    def _layers(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Transposed weight and bias of every layer, laid out as the product reads them."""
+        return {
+            layer: (np.ascontiguousarray(self.weights[f"{layer}.weight"].T), self.weights[f"{layer}.bias"])
+            for layer in LAYERS
+        }
+
     def _affine(self, x: np.ndarray, layer: str) -> np.ndarray:
-        return x @ self.weights[f"{layer}.weight"].T + self.weights[f"{layer}.bias"]
+        weight, bias = self._layers[layer]
+        return x @ weight + bias
 
     def encode(self, x: Float[np.ndarray, "N X"]) -> tuple[Float[np.ndarray, "N D"], Float[np.ndarray, "N D"]]:
         """Mean and standard deviation of the posterior q(z | x)."""
