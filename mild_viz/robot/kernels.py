@@ -158,12 +158,6 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
             if not _held(arm, q, gradient, i):
                 largest = max(largest, 2.0 * abs(gradient[i]))
         if largest <= TOLERANCE * max(1.0, scale):
-            # One more Newton step squares what is left, so that inputs that differ by rounding give the same solution
-            # to rounding. Where the arm can turn freely about its solution, the step would be large, and is not taken.
-            if _bounded_step(arm, hessian, 0.0, gradient, q, step, fixed, factor, rhs):
-                for i in range(n):
-                    if not fixed[i] and abs(step[i]) < 1e-6:
-                        q[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
             break
         improved = False
         while not improved and damping < 1e6 * scale:
@@ -191,6 +185,13 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
         _copy(candidate, q)
         _copy(moved, position)
         cost = new_cost
+    # The objective is flat to rounding here, the gradient is not: one more Newton step squares what is left, so that
+    # inputs that differ by rounding give the same solution to rounding. Where the arm can turn freely about its
+    # solution, the step would be large, and is not taken.
+    if _bounded_step(arm, hessian, 0.0, gradient, q, step, fixed, factor, rhs):
+        for i in range(n):
+            if not fixed[i] and abs(step[i]) < 1e-6:
+                q[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
 
 
 @njit(cache=True, fastmath=False)
