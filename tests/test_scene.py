@@ -14,8 +14,16 @@ from scene_rollouts import N_STATES, scene_inference, scene_rollout, without_tru
 
 from mild_viz.dashboard.recorder import private_server
 from mild_viz.dashboard.scene.figure import make_figure
-from mild_viz.dashboard.scene.latent import OPACITY_FLOOR, OPACITY_RANGE, TEXT_SIZE, dashed, segments, spread
-from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, PLOT_TURN, Camera
+from mild_viz.dashboard.scene.latent import (
+    OPACITY_FLOOR,
+    OPACITY_RANGE,
+    TEXT_SIZE,
+    dashed,
+    segments,
+    spread,
+    towards_viewer,
+)
+from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, Camera, picture_axes
 from mild_viz.dashboard.scene.palette import DARK, LIGHT, linear, state_color
 from mild_viz.dashboard.scene.projection import LARGEST_RADIUS, make_projection, nice_step
 from mild_viz.dashboard.scene.scene import Scene
@@ -184,6 +192,9 @@ def test_the_gap_between_the_hands_is_drawn_and_written(
         scene.set_frame(n)
         ends = node(server, "/reach/line").points[0]
         np.testing.assert_allclose(ends, [rollout.end_effector[n], rollout.target[n]], atol=1e-6)
+        assert node(server, "/reach/line").colors.tolist() == list(
+            LIGHT.contact if rollout.contact[n] else LIGHT.distance
+        )
         text = node(server, "/reach/distance").text
         assert text.startswith(f"{100.0 * rollout.hand_distance[n]:.1f} cm")
         assert text.endswith("contact") == rollout.contact[n] == node(server, "/reach/contact").visible
@@ -432,8 +443,7 @@ def test_dashes_cover_half_of_the_line() -> None:
 
 def test_state_names_do_not_overlap() -> None:
     spots = spread(0.05 * np.random.default_rng(2).normal(size=(12, 3)))
-    turn = -PLOT_TURN
-    across, high = spots @ [np.cos(turn), np.sin(turn), 0.0], spots[:, 2]
+    across, high = (spots @ axis for axis in picture_axes(towards_viewer()))
     wide, tall = (np.abs(values[:, None] - values[None]) for values in (across, high))
     overlap = (wide < 0.9 * TEXT_SIZE[0]) & (tall < 0.9 * TEXT_SIZE[1])
     assert overlap.sum() == len(spots), "only with themselves"

@@ -24,7 +24,7 @@ class HumanView:
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
         self._title, self._caption = add_title(server, ROOT, "Human")
         self._unobserved = add_label(server, f"{ROOT}/not_observed", "not observed", NOTE, "center-left")
-        self._lost = add_label(server, f"{ROOT}/lost", "tracking lost", NOTE, "bottom-center")
+        self._lost = add_label(server, f"{ROOT}/lost", "tracking lost", NOTE, "center-center")
         self._figure: Figure | None = None
         self._schematic: dict[str, viser.MeshHandle] = {}
         self._ground: tuple[Figure, float, bytes] | None = None
@@ -103,7 +103,7 @@ class HumanView:
         middle, height = figure.shoulders, figure.height
         crown = figure.crown
         self._title.position = self._caption.position = crown + [0.0, 0.0, 0.13]
-        self._lost.position = crown + [0.0, 0.0, 0.26]
+        self._lost.position = middle + [0.0, 0.0, -0.14 * height]
         self._unobserved.position = middle + [-0.04, 0.14 * height, (-0.45 if figure.whole else -0.24) * height]
         self._unobserved.visible = figure.soles is None
         self._caption.text = "red arm: model input" if figure.whole else "right arm observed"

@@ -9,8 +9,8 @@ import viser
 from jaxtyping import Float
 
 from mild_viz.dashboard.scene.labels import CAPTION, TICK, add_label, add_title
-from mild_viz.dashboard.scene.layout import PLOT_SIZE, PLOT_TURN, Layout
-from mild_viz.dashboard.scene.palette import Palette, Rgb, linear, state_color
+from mild_viz.dashboard.scene.layout import PLOT_SIZE, PLOT_TURN, VIEWER, Layout, picture_axes
+from mild_viz.dashboard.scene.palette import Palette, linear, state_color
 from mild_viz.dashboard.scene.projection import Projection, make_projection
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.rollout import Inference
@@ -148,7 +148,7 @@ class LatentView:
         self._trails = {}
         for name in TRACES:
             faint = colors.faint(tints[name], 0.5)
-            self._line(f"path_{name}", frames.lines[name], solid_color(faint, len(frames.lines[name])), 1.4)
+            self._line(f"path_{name}", frames.lines[name], np.array(faint, dtype=np.uint8), 1.4)
             fade = np.linspace(0.35, 1.0, TRAIL + 1)
             shades = np.array([colors.faint(tints[name], float(share)) for share in fade], dtype=np.uint8)
             self._trails[name] = self._line(
@@ -181,8 +181,13 @@ class LatentView:
                 text.position = spots[state]
 
     def _line(self, name: str, points: Segments, colors: np.ndarray, thickness: float) -> viser.LineSegmentsHandle:
+        """One colour (3,), or one for each end of each piece (K, 2, 3)."""
         return self._server.scene.add_line_segments(
-            f"{ROOT}/{name}", points, linear(colors), thickness=thickness, thickness_units="screen"
+            f"{ROOT}/{name}",
+            points,
+            colors if colors.ndim == 1 else linear(colors),
+            thickness=thickness,
+            thickness_units="screen",
         )
 
 
@@ -220,7 +225,7 @@ def filled(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 def spread(spots: Float[np.ndarray, "K 3"], steps: int = 150) -> Float[np.ndarray, "K 3"]:
     """Push texts apart that would overlap as seen from the dyad's viewer, within the plane of the picture."""
-    right, up = np.array([np.cos(-PLOT_TURN), np.sin(-PLOT_TURN), 0.0]), np.array([0.0, 0.0, 1.0])
+    right, up = picture_axes(towards_viewer())
     spots = spots.copy()
     # Ties are broken by order: equal places would otherwise push in no direction.
     spots += 1e-4 * np.arange(len(spots))[:, None] * (right + up)
@@ -236,6 +241,14 @@ def spread(spots: Float[np.ndarray, "K 3"], steps: int = 150) -> Float[np.ndarra
         spots += np.outer(np.where(sideways, push * np.sign(across), 0.0).sum(1), right)
         spots += np.outer(np.where(sideways, 0.0, push * np.sign(high)).sum(1), up)
     return spots
+
+
+def towards_viewer() -> Float[np.ndarray, " 3"]:
+    """From the box to the viewer, in the box's coordinates."""
+    x, y, z = VIEWER
+    turn = complex(np.cos(PLOT_TURN), -np.sin(PLOT_TURN))
+    level = complex(x, y) * turn
+    return np.array([level.real, level.imag, z])
 
 
 def grid_lines(ticks: list[Float[np.ndarray, " _"]]) -> Segments:
@@ -259,8 +272,3 @@ def box_edges() -> Segments:
         [(a, a, a), (a, a, b)], [(a, b, a), (a, b, b)], [(b, b, a), (b, b, b)], [(a, a, b), (a, b, b)],
         [(a, b, b), (b, b, b)],
     ])  # fmt: skip
-
-
-def solid_color(color: Rgb, count: int) -> np.ndarray:
-    """The same colour for both ends of each piece."""
-    return np.tile(np.array(color, dtype=np.uint8), (count, 2, 1))

@@ -18,6 +18,9 @@ PLOT_SIZE = 1.3
 PLOT_TURN = -np.radians(28.0)
 """The box is turned about z, so that two of its walls stand behind what is drawn."""
 
+VIEWER = np.array([-0.12, -0.97, 0.19])
+"""From the plot to the camera of the preset 'both': forward, left and up of the robot."""
+
 FIELD_OF_VIEW = np.radians(28.0)
 """Vertical field of view: narrow, so that figures at the sides of the picture do not lean outwards."""
 
@@ -111,9 +114,7 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
 def fitted(points: Float[np.ndarray, "P 3"], direction: Vector, aspect: float, margin: float) -> Camera:
     """The nearest camera on the side of `direction` that sees all points, `margin` of the picture left free."""
     towards = direction / np.linalg.norm(direction)
-    right = np.cross(-towards, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    above = np.cross(right, -towards)
+    right, above = picture_axes(towards)
     half = np.tan(FIELD_OF_VIEW / 2.0) * (1.0 - 2.0 * margin)
     across, high, depth = points @ right, points @ above, points @ towards
     # A point is inside the picture when |across - x| <= aspect half (distance - depth), and so for height:
@@ -123,6 +124,14 @@ def fitted(points: Float[np.ndarray, "P 3"], direction: Vector, aspect: float, m
     far = max(far_x, far_y)
     position = x * right + y * above + far * towards
     return pinhole(position, position - (far - float(depth.mean())) * towards, float(FIELD_OF_VIEW))
+
+
+def picture_axes(towards: Vector) -> tuple[Vector, Vector]:
+    """Unit vectors to the right and upwards in the picture of a camera on the side of `towards`."""
+    right = np.cross(-towards, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    above = np.cross(towards, right)
+    return right, above / np.linalg.norm(above)
 
 
 def centred(offsets: Float[np.ndarray, " P"], depth: Float[np.ndarray, " P"], slope: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import viser
 from jaxtyping import Float
 
 from mild_viz.dashboard.scene.labels import NOTE, add_label
-from mild_viz.dashboard.scene.palette import Palette, linear
+from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.rollout import Rollout
 
 ROOT = "/reach"
@@ -35,8 +35,10 @@ class ReachView:
         self._texts = distance_texts(rollout)
         self._label_positions = np.nan_to_num(label_positions(rollout))
         self._known = np.isfinite(rollout.hand_distance)
+        # One colour for the whole line, from its creation on: the browser does not recompile a line whose colours
+        # change from one to many.
         self._colors = {
-            contact: linear(np.tile(np.array(color, dtype=np.uint8), (1, 2, 1)))
+            contact: np.array(color, dtype=np.uint8)
             for contact, color in ((True, colors.contact), (False, colors.distance))
         }
         self._contact.color = colors.contact
