@@ -9,9 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from mild_viz import paths
+from mild_viz import paths, pipeline
 from mild_viz.checkpoint import RobotInterface, load_checkpoint, save_checkpoint
 from mild_viz.dashboard.app import Dashboard, first_settings, open_dashboard
 from mild_viz.dashboard.catalog import Catalog
@@ -149,3 +150,43 @@ def test_contact_states_that_cannot_be_saved_say_so(dashboard: Dashboard, model:
     assert "Not saved" in dashboard.controls._states._saved.content
     assert "cannot be written" in dashboard.controls._states._saved.content
     (model / "contact_states.json").rmdir()
+
+
+def test_tracking_lost_for_seconds_is_drawn_as_a_gap(dashboard: Dashboard) -> None:
+    choice, rollout = dashboard.session.choice, dashboard.session.rollout
+    assert choice is not None and rollout is not None
+    arm = choice.trial.human_arm.copy()
+    arm[40:100] = np.nan
+    trial = replace(choice.trial, human_arm=arm, human_skeleton=None)
+    inference = pipeline.infer(choice.checkpoint, trial, "v3.1")
+    gap = pipeline.control(inference, choice.checkpoint, dashboard.robot, trial, choice.settings.control)
+    assert not gap.inference.observed.all()
+    dashboard._show(gap, replace(choice, trial=trial), True)
+    for frame in range(0, gap.inference.n_windows, 3):
+        dashboard.scene.set_frame(frame)
+        dashboard._tick(frame, False)
+    lanes = dashboard.timeline._lanes
+    assert "mv-lost" in lanes["alpha"].content and "grey: lost" in lanes["alpha"].content
+    assert all("nan" not in lane.content.lower() for lane in lanes.values())
+    dashboard._show(rollout, choice, True)
+
+
+def test_hours_of_use_do_not_make_joining_slower(dashboard: Dashboard) -> None:
+    """viser replays to a new browser whatever it keeps: playing and turning must not make that grow."""
+    session = dashboard.session
+    kept = dashboard.server._websock_server._broadcast_buffer.message_from_id
+    slider = dashboard.controls._robot._lambda_q
+
+    def use() -> int:
+        for i in range(6):
+            slider.value = -2.0 + 0.1 * (i % 2)
+            session.mark_dirty()
+            assert session.wait_idle()
+            for frame in range(0, dashboard.player.n_frames, 5):
+                dashboard.scene.set_frame(frame)
+                dashboard._tick(frame, bool(frame % 2))
+        dashboard.server._run_garbage_collector(force=True)
+        return len(kept)
+
+    first = use()
+    assert use() <= first + 2

@@ -196,7 +196,9 @@ def test_placement_moves_the_human_and_can_be_reset(paused: Page, dashboard: Das
     tab(page, "Robot")
     first = shown(dashboard)
     distance = round(first.placement.distance + 0.2, 2)
+    before = canvas(page)
     moved = after(dashboard, lambda: slide(page, "Distance", f"{distance}"), 0, 1)
+    assert (abs(canvas(page) - before).max(axis=2) > 30).mean() > 0.005, "the human is seen elsewhere"
     assert moved.placement.distance == pytest.approx(distance)
     assert np.linalg.norm(moved.T_world_human[:3, 3] - first.T_world_human[:3, 3]) == pytest.approx(0.2, abs=0.02)
     eventually(
@@ -266,9 +268,9 @@ def test_view_settings_rerun_nothing(paused: Page, dashboard: Dashboard) -> None
     eventually(lambda: (canvas(page) != before).any(), "the ellipsoids grow")
     after(dashboard, lambda: slide(page, "Ellipsoid σ", "1"), 0, 0)
     after(dashboard, lambda: choose(page, "Latent axes", "dimensions"), 0, 0)
-    after(dashboard, lambda: choose(page, "Axis x", "4"), 0, 0)
+    after(dashboard, lambda: choose(page, "Axis x", "z3"), 0, 0)
     assert dashboard.session.choice is not None and dashboard.session.choice.view.latent_axes == (3, 1, 2)
-    after(dashboard, lambda: choose(page, "Axis x", "1"), 0, 0)
+    after(dashboard, lambda: choose(page, "Axis x", "z0"), 0, 0)
     after(dashboard, lambda: choose(page, "Latent axes", "principal components"), 0, 0)
     before = canvas(page)
     after(dashboard, lambda: tick(page, "Show robot", False), 0, 0)
@@ -369,11 +371,11 @@ def test_a_failing_change_says_why_and_keeps_the_last_good_state(paused: Page, d
     tab(page, "View")
     after(dashboard, lambda: choose(page, "Latent axes", "dimensions"), 0, 0)
     good = dashboard.session.choice
-    choose(page, "Axis y", "1")
-    page.locator(".mv-error", has_text="three different dimensions").wait_for()
+    choose(page, "Axis y", "z0")
+    page.locator(".mv-error", has_text="three different latent dimensions").wait_for()
     assert page.locator(".mantine-Notification-root", has_text="could not be done").count() == 1
     assert dashboard.session.choice is good and dashboard.session.error is not None
-    choose(page, "Axis y", "2")
+    choose(page, "Axis y", "z1")
     eventually(lambda: page.locator(".mv-error").count() == 0, "the message goes away")
     after(dashboard, lambda: choose(page, "Latent axes", "principal components"), 0, 0)
 

@@ -88,12 +88,14 @@ class Dashboard:
 
     async def _welcome(self, client: viser.ClientHandle) -> None:
         """Fit the camera to a new browser's canvas, which takes its final shape when the panels have docked."""
+        while self.scene.layout is None and client.client_id in self.server.get_clients():
+            await asyncio.sleep(0.1)
         aspect = 0.0
         for _ in range(6):
             await asyncio.sleep(0.25)
             with contextlib.suppress(Exception):  # the browser may be gone again
                 now = client.camera.image_width / max(client.camera.image_height, 1)
-                if self.scene.layout is not None and abs(now - aspect) > 0.01 * now:
+                if abs(now - aspect) > 0.01 * now:
                     self.scene.move_camera(client, "both")
                     aspect = now
 

@@ -18,7 +18,7 @@ from mild_viz.dashboard.tabs.robot import RobotTab
 from mild_viz.dashboard.tabs.states import StatesTab
 from mild_viz.dashboard.tabs.trial import TrialTab
 from mild_viz.dashboard.tabs.view import ViewTab
-from mild_viz.dashboard.tabs.widgets import set_content
+from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.rollout import Rollout
 from mild_viz.settings import InferSettings, Settings
@@ -93,12 +93,12 @@ class Controls:
             return
         set_content(
             self._error,
-            f'<div class="mv-error" role="alert"><b>This could not be done.</b> {escape(message)} '
+            f'<div class="mv-error" role="alert"><b>This could not be done.</b> {escape(sentence(message))} '
             "The last good result is still shown.</div>",
         )
         self._error.visible = True
         for client in self._server.get_clients().values():
-            client.add_notification("This could not be done", message, color="red", auto_close_seconds=8.0)
+            client.add_notification("This could not be done", sentence(message), color="red", auto_close_seconds=8.0)
 
     def _save_contact_states(self) -> None:
         choice = self._choice

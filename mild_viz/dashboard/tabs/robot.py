@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from mild_viz.checkpoint import Checkpoint
-from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, set_content, widget_id
+from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, sentence, set_content, widget_id
 from mild_viz.rollout import Rollout
 from mild_viz.settings import CONTROLLERS, ControlSettings, Placement
 from mild_viz.trial import Trial
@@ -114,8 +114,3 @@ class RobotTab:
         self._placed = {axis: float(slider.value) for axis, slider in self._place.items()}
         self._reset.disabled = self._chosen is None
         set_content(self._source, f'<div class="mv-note">{escape(sentence(rollout.placement.source))}</div>')
-
-
-def sentence(text: str) -> str:
-    """With a capital and a full stop."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""

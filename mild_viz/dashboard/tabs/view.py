@@ -9,6 +9,7 @@ import viser
 from mild_viz.dashboard.scene.scene import CAMERAS
 from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, option
 from mild_viz.dashboard.view import ViewSettings
+from mild_viz.errors import UserError
 from mild_viz.rollout import Rollout
 from mild_viz.settings import ALPHA_MODES
 
@@ -38,8 +39,8 @@ class ViewTab:
         self._dimensions = [
             gui.add_dropdown(
                 f"Axis {axis}",
-                tuple("123"),
-                initial_value=str(i + 1),
+                ("z0", "z1", "z2"),
+                initial_value=f"z{i}",
                 visible=False,
                 hint=f"Latent dimension on the {axis} axis.",
             )
@@ -68,7 +69,10 @@ class ViewTab:
         for handle in self._dimensions:
             if handle.visible != by_dimension:
                 handle.visible = by_dimension
-        x, y, z = (int(option(handle)) - 1 for handle in self._dimensions)
+        names = [option(handle) for handle in self._dimensions]
+        if by_dimension and len(set(names)) < len(names):
+            raise UserError(f"the axes show {', '.join(names)}; valid: three different latent dimensions")
+        x, y, z = (int(name.removeprefix("z")) for name in names)
         human, robot, latent = (bool(handle.value) for handle in self._visible.values())
         return ViewSettings(
             alpha_mode=option(self._alpha),
@@ -85,4 +89,4 @@ class ViewTab:
         """Offer the latent dimensions that the model has."""
         n_dimensions = rollout.inference.human_latent_mean.shape[1]
         for handle in self._dimensions:
-            offer(handle, (str(i + 1) for i in range(n_dimensions)))
+            offer(handle, (f"z{i}" for i in range(n_dimensions)))

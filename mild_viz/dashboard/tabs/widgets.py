@@ -57,6 +57,11 @@ def set_content(handle: viser.GuiHtmlHandle, content: str) -> None:
         handle.content = content
 
 
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
 def widget_id(handle: Any) -> str:
     """The id of the widget's element in the page, for its style; viser has no public name for it."""
     return handle._impl.uuid
