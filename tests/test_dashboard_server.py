@@ -13,7 +13,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from mild_viz.dashboard.server import check_port, free_port, is_loopback, open_server
+from mild_viz.dashboard.server import check_port, free_port, is_loopback, open_server, page_url
 from mild_viz.dashboard.tabs.widgets import number, offer, on_person, option
 from mild_viz.errors import UserError
 
@@ -68,6 +68,19 @@ def test_an_address_of_another_machine_is_refused() -> None:
 def test_which_addresses_only_this_machine_reaches() -> None:
     assert is_loopback("127.0.0.1") and is_loopback("localhost") and is_loopback("::1")
     assert not is_loopback("0.0.0.0") and not is_loopback("192.168.1.2") and not is_loopback("example.org")
+
+
+@pytest.mark.parametrize(
+    ("host", "url"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:80"),
+        ("0.0.0.0", "http://127.0.0.1:80"),
+        ("::", "http://[::1]:80"),
+        ("example.org", "http://example.org:80"),
+    ],
+)
+def test_the_address_that_is_printed_opens_in_a_browser(host: str, url: str) -> None:
+    assert page_url(host, 80) == url
 
 
 def websocket(server: viser.ViserServer, origin: str | None):

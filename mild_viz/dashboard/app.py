@@ -17,7 +17,7 @@ from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
-from mild_viz.dashboard.server import check_port, is_loopback, open_server
+from mild_viz.dashboard.server import check_port, is_loopback, open_server, page_url
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
@@ -37,7 +37,7 @@ class Dashboard:
         self, host: str, port: int, catalog: Catalog, robot: RobotModel, model: str, first: InferSettings
     ) -> None:
         self.server = open_server(host, port, LABEL)
-        self.url = f"http://{host}:{port}"
+        self.url = page_url(host, port)
         self.robot = robot
         self._dark: bool | None = None
         self._set_theme(False)

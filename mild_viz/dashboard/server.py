@@ -29,6 +29,12 @@ def is_loopback(host: str) -> bool:
         return False
 
 
+def page_url(host: str, port: int) -> str:
+    """Where a browser on this machine finds the page. An address that stands for all is replaced by one of them."""
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
+
+
 def _can_bind(host: str, port: int) -> bool:
     """Whether a server could listen there. Raises UserError for an address that is not this machine's."""
     try:
