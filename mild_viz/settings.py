@@ -53,7 +53,8 @@ class Placement:
     """Where the human stands seen from the robot: the human frame's origin from the robot's shoulder [m].
 
     The shoulder is the first controlled joint, so that descriptions with another base give the same place.
-    The human faces the robot (yaw of pi about z) unless the recording says otherwise. `source` says in words where the numbers come from.
+    The human faces the robot (yaw of pi about z) unless the recording says otherwise. `source` says in words
+    where the numbers come from.
     """
 
     distance: float
