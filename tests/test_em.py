@@ -38,7 +38,7 @@ def test_log_likelihood_follows_hmmlearn(data: list[np.ndarray]) -> None:
 
     theirs = GaussianHMM(
         4, covariance_type="full", init_params="", n_iter=8, tol=-np.inf, min_covar=0.0, covars_prior=0.0,
-        covars_weight=0.0, implementation="log",
+        covars_weight=0, implementation="log",
     )  # fmt: skip
     theirs.startprob_, theirs.transmat_ = start.initial_probs.copy(), start.transition_matrix.copy()
     theirs.means_, theirs.covars_ = start.emission_means.copy(), start.emission_covariances.copy()

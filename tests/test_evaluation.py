@@ -88,7 +88,7 @@ def test_the_papers_rows_are_those_of_its_table(shared: Callable[[str], Path]) -
         table = pd.read_csv(shared(f"reference/paper/{file}"))
         table = table[table.dataset == label]
         expected = {
-            ("paper " + {"buetepage": "Bütepage"}.get(m, m), names[a], mean, std)
+            ("paper " + ("Bütepage" if m == "buetepage" else m), names[a], mean, std)
             for m, a, mean, std in zip(table.model, table.action, table.mse_mean, table.mse_std, strict=True)
         }
         assert set(paper_rows(dataset, human_human)) == expected

@@ -34,8 +34,8 @@ def paper(hmm: HMM, z: np.ndarray, alpha: np.ndarray, std: np.ndarray | None) ->
         gain = sigma[size:, :size] @ np.linalg.inv(sigma[:size, :size] + posterior)
         means.append(mu[size:] + gain @ (z - mu[:size]))
         second.append(sigma[size:, size:] - gain @ sigma[:size, size:] + np.outer(means[-1], means[-1]))
-    mean = sum(a * m for a, m in zip(alpha, means, strict=True))
-    return mean, sum(a * s for a, s in zip(alpha, second, strict=True)) - np.outer(mean, mean)
+    mean = np.sum([a * m for a, m in zip(alpha, means, strict=True)], axis=0)
+    return mean, np.sum([a * s for a, s in zip(alpha, second, strict=True)], axis=0) - np.outer(mean, mean)
 
 
 @pytest.mark.parametrize("with_covariance", [False, True])
