@@ -129,7 +129,7 @@ def _strip(values: Int[np.ndarray, " N"], css: str, colors: dict[int, str], name
 def _states(rollout: Rollout) -> str:
     inference = rollout.inference
     states = range(inference.n_states)
-    colors, numbers = {s: state_color(s) for s in states}, {s: str(s + 1) for s in states}
+    colors, numbers = {s: state_color(s) for s in states}, {s: str(s) for s in states}
     strip = _strip(inference.active_state, "mv-strip", colors, numbers)
     contact_colors = {0: "transparent", 1: "var(--mantine-color-text)"}
     contact = _strip(rollout.contact.astype(np.int64), "mv-contact", contact_colors, {0: "", 1: ""})

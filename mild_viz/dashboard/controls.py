@@ -112,7 +112,7 @@ class Controls:
         except UserError as error:
             self._states.say_saved(f"Not saved: {error}")
             return
-        names = ", ".join(str(state + 1) for state in sorted(states)) or "none"
+        names = ", ".join(str(state) for state in sorted(states)) or "none"
         self._states.say_saved(f"Saved: {names} for {action}, the default of {choice.checkpoint.name} from now on.")
 
 
@@ -135,5 +135,5 @@ def now_html(rollout: Rollout, frame: int) -> str:
     phase = "contact" if rollout.contact[frame] else "no contact"
     return (
         f'<div class="mv-header mv-live"><span class="mv-swatch" style="background:{state_color(state)}"></span>'
-        f"State <b>{state + 1}</b> · {phase} · hands <b>{100 * rollout.hand_distance[frame]:.1f} cm</b> apart</div>"
+        f"State <b>{state}</b> · {phase} · hands <b>{100 * rollout.hand_distance[frame]:.1f} cm</b> apart</div>"
     )

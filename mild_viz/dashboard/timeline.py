@@ -66,8 +66,10 @@ class Timeline:
             if event.client_id is not None:
                 player.loop = bool(self._loop.value)
 
+        # On the loop, unlike the others: there the player writes the bar ten times a second, and a value that was
+        # read a moment later in another thread could be the player's and not the person's.
         @self._frame.on_update
-        def _(event: viser.GuiEvent) -> None:
+        async def _(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
                 player.scrub(int(self._frame.value))
 
@@ -126,7 +128,7 @@ def _now(rollout: Rollout, frame: int) -> str:
     distance = 100.0 * rollout.hand_distance[frame]
     parts = [
         f"<b>{inference.time[frame]:.2f} s</b> of {inference.time[-1]:.2f} s",
-        f'<span class="mv-swatch" style="background:{charts.state_color(state)}"></span>state {state + 1}',
+        f'<span class="mv-swatch" style="background:{charts.state_color(state)}"></span>state {state}',
         "contact" if rollout.contact[frame] else "free motion",
         f"hand distance {distance:.1f} cm",
     ]

@@ -173,7 +173,7 @@ class LatentView:
                     )
                 )  # fmt: skip
                 name = f"{ROOT}/{agent}/label{state}"
-                labels.append(add_label(self._server, name, f"{agent[0]}{state + 1}", TICK, "center-center"))
+                labels.append(add_label(self._server, name, f"{agent[0]}{state}", TICK, "center-center"))
             centres, wxyzs, radii = frames.ellipsoids[agent]
             for state, (handle, text) in enumerate(zip(handles, labels, strict=True)):
                 handle.position, handle.wxyz = centres[state], wxyzs[state]

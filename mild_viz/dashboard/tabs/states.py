@@ -45,7 +45,7 @@ class StatesTab:
         with self._folder:
             for state in range(len(self._boxes), n_states):
                 box = self._gui.add_checkbox(
-                    f"State {state + 1}", False, hint="Ticked: the partners touch in this state, and mild-ik adapts."
+                    f"State {state}", False, hint="Ticked: the partners touch in this state, and mild-ik adapts."
                 )
                 css = BOX_CSS.replace("ID", widget_id(box)).replace("COLOR", state_color(state))
                 self._gui.add_html(f"<style>{css}</style>")
@@ -82,6 +82,6 @@ class StatesTab:
         for state in range(rollout.inference.n_states):
             length, share = rollout.state_durations[state], rollout.state_occupancy[state]
             times = f"{length:.2f} s, {100 * share:.0f} %" if share > 0 else "not visited"
-            label = f"State {state + 1}: {times}"
+            label = f"State {state}: {times}"
             if self._boxes[state].label != label:
                 self._boxes[state].label = label
