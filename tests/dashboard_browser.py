@@ -90,7 +90,13 @@ def scene_nodes(page: Page) -> list[str]:
 
 
 def rectangle(page: Page, selector: str) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom of an element [px]."""
-    box = page.locator(selector).first.bounding_box()
-    assert box is not None, f"{selector} is not on the page"
+    """Left, top, right, bottom of an element [px], once it rests: viser eases its panels to new sizes."""
+    last = None
+    for _ in range(50):
+        box = page.locator(selector).first.bounding_box()
+        assert box is not None, f"{selector} is not on the page"
+        if box == last:
+            break
+        last = box
+        page.wait_for_timeout(150)
     return box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]

@@ -69,10 +69,10 @@ class Dashboard:
         self.scene.show(rollout, choice.view)
         before = self.session.choice
         restart = before is None or before.trial is not choice.trial
-        self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
         self.controls.show(rollout, choice)
         self.timeline.show(rollout, choice.view.alpha_mode)
-        self._tick(self.player.frame, self.player.playing)
+        # Last: the player then draws this frame and lets the texts follow, on its own thread.
+        self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
         if before is None:
             # Reading all datasets may take seconds: the page stands already, and the list completes itself.
             threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()

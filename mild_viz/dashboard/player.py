@@ -43,6 +43,7 @@ class Player:
         self._position = 0.0
         self._held_until = self._last_toggle = float("-inf")
         self._drawn: int | None = None
+        self._told: tuple[int, bool] | None = None
         self.n_frames = 1
         self.rate = 30.0
         self.loop = loop
@@ -58,7 +59,7 @@ class Player:
         with self._lock:
             self.n_frames, self.rate = max(n_frames, 1), rate
             self._position = 0.0 if restart else min(self._position, self.n_frames - 1.0)
-            self._drawn = None
+            self._drawn = self._told = None
 
     def toggle(self) -> None:
         """Play or pause; at the end, play starts again from the first frame."""
@@ -112,7 +113,6 @@ class Player:
     async def run(self) -> None:
         """Play for ever. Run it on viser's loop: a thread of its own would cost more and draw no smoother."""
         before = next_tick = time.monotonic()
-        told: tuple[int, bool] | None = None
         while True:
             await asyncio.sleep(self._wait())
             now = time.monotonic()
@@ -126,9 +126,9 @@ class Player:
                 if frame != self._drawn:
                     self._draw(frame)
                     self._drawn = frame
-                if now >= next_tick and told != (frame, self.playing):
-                    told, next_tick = (frame, self.playing), now + TICK_PERIOD
-                    self._tick(*told)
+                if now >= next_tick and self._told != (frame, self.playing):
+                    self._told, next_tick = (frame, self.playing), now + TICK_PERIOD
+                    self._tick(frame, self.playing)
             except Exception:  # one bad frame must not end playback for good
                 log.exception("playback: frame %d could not be drawn", self.frame)
                 self.playing = False

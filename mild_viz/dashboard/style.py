@@ -12,7 +12,7 @@ PANEL_WIDTH = 344
 """Width of the control panel [px]."""
 FLOATING_SIZE = (900, 300)
 """Size of the timeline where it cannot be docked [px]."""
-GUTTER = (124, 58)
+GUTTER = (124, 64)
 """Space left and right of every chart for its name and its range [px]."""
 
 TIMELINE_CSS = """
@@ -56,7 +56,7 @@ div:has(> div > .mv-timeline) > div:nth-child(6) > div > div:first-child {
   width: LEFTpx !important; text-align: right; box-sizing: border-box; padding-right: 8px;
 }
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-InputWrapper-root {
-  width: 46px !important; margin-inline: 10px 2px;
+  width: 46px !important; margin-inline: 14px 4px !important;
 }
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-Slider-root { margin-inline: -3.7px; }
 div:has(> div > .mv-timeline) > div:nth-child(4) input { display: block; }
@@ -111,7 +111,7 @@ CHART_CSS = """
 .mv-rows { flex: 1; min-height: 0; }
 .mv-row { display: flex; }
 .mv-row .mv-name { font-size: 10px; }
-.mv-one { justify-content: center; font-size: 9px !important; letter-spacing: -0.3px; white-space: nowrap; }
+.mv-one { justify-content: center; letter-spacing: -0.3px; white-space: nowrap; }
 .mv-over { position: absolute; top: 0; bottom: 0; left: LEFTpx; right: RIGHTpx; pointer-events: none; }
 .mv-axis .mv-plot { border: none; }
 .mv-axis span {

@@ -49,7 +49,8 @@ class RobotTab:
                 )
             }
             self._reset = gui.add_button("Reset placement", icon=viser.Icon.RESTORE, hint="Back to where it came from.")
-        self._placed: dict[str, float] = {}
+        self._own: dict[str, float] = {}
+        """Where the trial's own placement put the sliders; empty until it did."""
         self._chosen: Placement | None = None
         self._to_reset = False
         self._of: tuple[object, ...] = ()
@@ -98,19 +99,21 @@ class RobotTab:
         # A recording with one world frame has its own placement per trial; else it is the model's for all.
         of = (checkpoint.human_vae, trial.name if trial.T_world_human is not None else trial.dataset)
         if of != self._of or self._to_reset:
-            self._of, self._to_reset, self._chosen, self._placed = of, False, None, {}
-        values = {axis: number(slider) for axis, slider in self._place.items()} if self._placed else {}
-        if values != self._placed:
+            self._of, self._to_reset, self._chosen, self._own = of, False, None, {}
+        if not self._own:
+            return None  # the sliders do not stand for this trial yet
+        values = {axis: number(slider) for axis, slider in self._place.items()}
+        if self._chosen is not None or values != self._own:
             self._chosen = Placement(values["distance"], values["lateral"], values["height"], "chosen on this page")
         return self._chosen
 
     def show(self, rollout: Rollout) -> None:
         """Put the sliders where the human stands, and say where that comes from."""
-        if self._chosen is None:
+        if not self._own:  # only then: a slider that a person is moving must not be touched
+            self._own = {axis: round(float(getattr(rollout.placement, axis)), 2) for axis in self._place}
             for axis, slider in self._place.items():
-                value = round(getattr(rollout.placement, axis), 2)
+                value = self._own[axis]
                 slider.min, slider.max = round(value - REACH, 2), round(value + REACH, 2)
                 slider.value = value
-        self._placed = {axis: float(slider.value) for axis, slider in self._place.items()}
         self._reset.disabled = self._chosen is None
         set_content(self._source, f'<div class="mv-note">{escape(sentence(rollout.placement.source))}</div>')
