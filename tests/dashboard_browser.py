@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import re
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from PIL import Image
+
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
+
+    from mild_viz.dashboard.app import Dashboard
+    from mild_viz.rollout import Rollout
 
 READY = """() => {
   const nodes = Object.keys(window.__viserSceneTree?.getState() ?? {});
@@ -100,3 +107,41 @@ def rectangle(page: Page, selector: str) -> tuple[float, float, float, float]:
         last = box
         page.wait_for_timeout(150)
     return box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]
+
+
+def shown(dashboard: Dashboard) -> Rollout:
+    assert dashboard.session.rollout is not None
+    return dashboard.session.rollout
+
+
+def after(dashboard: Dashboard, action: Callable[[], Any], infer: int, control: int) -> Rollout:
+    """The rollout after an action that must rerun inference and control so many times."""
+    session = dashboard.session
+    before = session.n_infer, session.n_control, session.n_shown
+    action()
+    eventually(lambda: session.n_shown > before[2], "the page shows something new")
+    assert session.wait_idle() and session.error is None
+    assert (session.n_infer - before[0], session.n_control - before[1]) == (infer, control)
+    time.sleep(0.15)  # viser's own throttle of a browser's messages
+    return shown(dashboard)
+
+
+def widgets(dashboard: Dashboard) -> dict[str, tuple[str, Any]]:
+    """Id and properties of every widget by its label."""
+    handles: list[Any] = list(dashboard.server.gui._gui_input_handle_from_uuid.values())
+    found = {handle._impl.props.label: (handle._impl.uuid, handle._impl.props) for handle in handles}
+    assert len(found) == len(handles), "no two have the same label"
+    return found
+
+
+def canvas(page: Page) -> np.ndarray:
+    """The scene's pixels, once two pictures in a row are the same (at most some seconds)."""
+    place = page.locator("canvas[data-engine]")
+    last = b""
+    for _ in range(12):
+        page.wait_for_timeout(300)
+        picture = place.screenshot()
+        if picture == last:
+            break
+        last = picture
+    return np.asarray(Image.open(io.BytesIO(last)).convert("RGB")).astype(int)

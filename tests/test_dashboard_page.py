@@ -3,112 +3,33 @@
 from __future__ import annotations
 
 import csv
-import io
-import shutil
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 from dashboard_browser import (
+    after,
+    canvas,
     choose,
     eventually,
     open_page,
-    options,
     rectangle,
     row,
     scene_nodes,
-    scene_props,
-    slide,
+    shown,
     tab,
     tick,
     wait_ready,
-)  # fmt: skip
-from PIL import Image
+)
 
-from mild_viz import paths
-from mild_viz.checkpoint import load_checkpoint
 from mild_viz.dashboard.app import Dashboard, open_dashboard
-from mild_viz.dashboard.server import free_port
 from mild_viz.errors import UserError
-from mild_viz.rollout import Rollout
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-HOST = "127.0.0.1"
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the demo model: contact states are saved into its folder."""
-    return Path(shutil.copytree(paths.default_checkpoint("demo"), tmp_path_factory.mktemp("models") / "demo-copy"))
-
-
-@pytest.fixture(scope="module")
-def dashboard(model: Path) -> Iterator[Dashboard]:
-    port = free_port(HOST, 18_000)
-    assert port is not None
-    dashboard = open_dashboard(checkpoint=model, dataset="demo", action="handshake", port=port)
-    assert dashboard.session.wait_idle() and dashboard.session.error is None
-    yield dashboard
-    dashboard.stop()
-
-
-@pytest.fixture(scope="module")
-def page(chromium: Browser, dashboard: Dashboard) -> Iterator[Page]:
-    page = open_page(chromium, dashboard.url)
-    yield page
-    page.close()
-
-
-@pytest.fixture
-def paused(page: Page, dashboard: Dashboard) -> Page:
-    """The page, paused in the middle of the trial."""
-    dashboard.player.playing = False
-    dashboard.player.seek(dashboard.player.n_frames // 2)
-    page.wait_for_timeout(200)
-    return page
-
-
-def shown(dashboard: Dashboard) -> Rollout:
-    assert dashboard.session.rollout is not None
-    return dashboard.session.rollout
-
-
-def after(dashboard: Dashboard, action: Callable[[], Any], infer: int, control: int) -> Rollout:
-    """The rollout after an action that must rerun inference and control so many times."""
-    session = dashboard.session
-    before = session.n_infer, session.n_control, session.n_shown
-    action()
-    eventually(lambda: session.n_shown > before[2], "the page shows something new")
-    assert session.wait_idle() and session.error is None
-    assert (session.n_infer - before[0], session.n_control - before[1]) == (infer, control)
-    time.sleep(0.15)  # viser's own throttle of a browser's messages
-    return shown(dashboard)
-
-
-def widgets(dashboard: Dashboard) -> dict[str, tuple[str, Any]]:
-    """Id and properties of every widget by its label."""
-    handles: list[Any] = list(dashboard.server.gui._gui_input_handle_from_uuid.values())
-    found = {handle._impl.props.label: (handle._impl.uuid, handle._impl.props) for handle in handles}
-    assert len(found) == len(handles), "no two have the same label"
-    return found
-
-
-def canvas(page: Page) -> np.ndarray:
-    """The scene's pixels, once two pictures in a row are the same (at most some seconds)."""
-    place = page.locator("canvas[data-engine]")
-    last = b""
-    for _ in range(12):
-        page.wait_for_timeout(300)
-        picture = place.screenshot()
-        if picture == last:
-            break
-        last = picture
-    return np.asarray(Image.open(io.BytesIO(last)).convert("RGB")).astype(int)
+pytest_plugins = ["dashboard_page_fixtures"]
 
 
 def test_the_page_shows_three_groups(page: Page, dashboard: Dashboard) -> None:
@@ -159,131 +80,6 @@ def test_nothing_overlaps_or_overflows(paused: Page, dashboard: Dashboard, width
         assert region.evaluate("e => e.scrollWidth <= e.clientWidth + 1 && e.scrollHeight <= e.clientHeight + 1"), name
     page.set_viewport_size({"width": 1280, "height": 720})
     rectangle(page, "[data-floating-window]")
-
-
-def test_every_control_has_a_hint(dashboard: Dashboard) -> None:
-    hints = {label: props.hint for label, (_, props) in widgets(dashboard).items()}
-    assert len(hints) > 25
-    assert [label for label, hint in hints.items() if not hint] == []
-    assert [label for label, hint in hints.items() if len(hint) > 110] == [], "of one line"
-
-
-def test_control_settings_rerun_only_the_control(paused: Page, dashboard: Dashboard) -> None:
-    page = paused
-    tab(page, "Robot")
-    first = shown(dashboard)
-    decoded = after(dashboard, lambda: choose(page, "Controller", "mild"), 0, 1)
-    assert decoded.controller == "mild" and decoded.inference is first.inference
-    plain = after(dashboard, lambda: choose(page, "Controller", "base-ik"), 0, 1)
-    assert not np.allclose(plain.joints_commanded, decoded.joints_commanded)
-    mild_ik = after(dashboard, lambda: choose(page, "Controller", "mild-ik"), 0, 1)
-    assert np.array_equal(mild_ik.joints_commanded, first.joints_commanded)
-    heavy = after(dashboard, lambda: slide(page, "λq", "2"), 0, 1)
-    assert dashboard.session.choice is not None
-    assert dashboard.session.choice.settings.control.lambda_q == 100.0
-    assert heavy.hand_distance[heavy.contact].mean() > mild_ik.hand_distance[mild_ik.contact].mean()
-    assert row(page, "λq = 100").is_visible(), "the weight itself is written, not its exponent"
-    after(dashboard, lambda: slide(page, "λq", "-2"), 0, 1)
-    after(dashboard, lambda: slide(page, "λx", "-4"), 0, 1)
-    assert dashboard.session.choice.settings.control.lambda_x == 1e-4
-    after(dashboard, lambda: slide(page, "λx", "0"), 0, 1)
-    rough = after(dashboard, lambda: slide(page, "Smoothing", "1"), 0, 1)
-    assert not np.array_equal(rough.joints_commanded, first.joints_commanded)
-    after(dashboard, lambda: slide(page, "Smoothing", "0.8"), 0, 1)
-    stiff = after(dashboard, lambda: tick(page, "Soft in contact", False), 0, 1)
-    assert (stiff.stiffness == 1.0).all() and (first.stiffness < 1.0).any()
-    again = after(dashboard, lambda: tick(page, "Soft in contact", True), 0, 1)
-    assert np.array_equal(again.joints_commanded, first.joints_commanded)
-
-
-def test_placement_moves_the_human_and_can_be_reset(paused: Page, dashboard: Dashboard) -> None:
-    page = paused
-    tab(page, "Robot")
-    first = shown(dashboard)
-    distance = round(first.placement.distance + 0.2, 2)
-    before = canvas(page)
-    moved = after(dashboard, lambda: slide(page, "Distance", f"{distance}"), 0, 1)
-    assert (abs(canvas(page) - before).max(axis=2) > 30).mean() > 0.005, "the human is seen elsewhere"
-    assert moved.placement.distance == pytest.approx(distance)
-    assert np.linalg.norm(moved.T_world_human[:3, 3] - first.T_world_human[:3, 3]) == pytest.approx(0.2, abs=0.02)
-    eventually(
-        lambda: "Chosen on this page" in page.locator(".mv-note", has_text="page").first.inner_text(), "it says so"
-    )
-    back = after(dashboard, lambda: page.get_by_role("button", name="Reset placement").click(), 0, 1)
-    assert np.array_equal(back.T_world_human, first.T_world_human)
-    assert back.placement.source == first.placement.source
-
-
-def test_contact_states_gate_the_controller_and_are_saved(paused: Page, dashboard: Dashboard, model: Path) -> None:
-    page = paused
-    tab(page, "States")
-    first = shown(dashboard)
-    assert first.contact_states and first.contact.any()
-    state = next(iter(first.contact_states))
-    for one in sorted(first.contact_states):
-        last = after(dashboard, lambda one=one: tick(page, f"State {one}", False), 0, 1)
-    assert last.contact_states == frozenset() and not last.contact.any()
-    only = after(dashboard, lambda: tick(page, f"State {state}", True), 0, 1)
-    assert only.contact_states == {state}
-    share = f"{100 * only.state_occupancy[state]:.0f} %" if only.state_occupancy[state] else "not visited"
-    assert share in row(page, f"State {state}").inner_text()
-    weights = (model / "weights.safetensors").stat()
-    page.get_by_role("button", name="Save contact states").click()
-    eventually((model / "contact_states.json").is_file, "the choice is saved")
-    assert load_checkpoint(model).contact_states["handshake"] == {state}
-    assert (model / "weights.safetensors").stat() == weights
-    page.get_by_text(f"Saved: {state} for handshake").wait_for()
-    for one in sorted(first.contact_states - {state}):
-        after(dashboard, lambda one=one: tick(page, f"State {one}", True), 0, 1)
-
-
-def test_trial_action_and_variant_rerun_everything(paused: Page, dashboard: Dashboard) -> None:
-    page = paused
-    tab(page, "Trial")
-    first = shown(dashboard)
-    other = next(name for name in options(page, "Trial") if name != f"test {first.inference.trial}")
-    second = after(dashboard, lambda: choose(page, "Trial", other), 1, 1)
-    assert f"{second.inference.split} {second.inference.trial}" == other
-    assert dashboard.player.frame == 0, "another trial starts at its beginning"
-    covariance = after(dashboard, lambda: choose(page, "Variant", "v3.2"), 1, 1)
-    assert covariance.inference.variant == "v3.2"
-    page.get_by_text("The posterior's spread is").wait_for()
-    after(dashboard, lambda: choose(page, "Variant", "v3.1"), 1, 1)
-    wave = after(dashboard, lambda: choose(page, "Action", "wave"), 1, 1)
-    assert wave.inference.action == "wave"
-    header = page.locator(".mv-header").first
-    eventually(lambda: "wave" in header.inner_text(), "the header names the action")
-    back = after(dashboard, lambda: choose(page, "Action", "handshake"), 1, 1)
-    assert back.inference.trial == first.inference.trial
-
-
-def test_view_settings_rerun_nothing(paused: Page, dashboard: Dashboard) -> None:
-    page = paused
-    tab(page, "View")
-    n = shown(dashboard).inference.active_state[dashboard.player.frame]
-    node = f"/latent/human/state{n}"
-    opacity = scene_props(page, node)["opacity"]
-    after(dashboard, lambda: choose(page, "Opacity by α", "unobserved"), 0, 0)
-    eventually(lambda: scene_props(page, node)["opacity"] != opacity, "the ellipsoid's opacity changes")
-    assert ">unobserved<" in page.locator(".mv-lane", has_text="Forward variable").inner_html()
-    after(dashboard, lambda: choose(page, "Opacity by α", "human"), 0, 0)
-    eventually(lambda: scene_props(page, node)["opacity"] == opacity, "it is as before")
-    before = canvas(page)
-    after(dashboard, lambda: slide(page, "Ellipsoid σ", "2"), 0, 0)
-    eventually(lambda: (canvas(page) != before).any(), "the ellipsoids grow")
-    after(dashboard, lambda: slide(page, "Ellipsoid σ", "1"), 0, 0)
-    after(dashboard, lambda: choose(page, "Latent axes", "dimensions"), 0, 0)
-    after(dashboard, lambda: choose(page, "Axis x", "z3"), 0, 0)
-    assert dashboard.session.choice is not None and dashboard.session.choice.view.latent_axes == (3, 1, 2)
-    after(dashboard, lambda: choose(page, "Axis x", "z0"), 0, 0)
-    after(dashboard, lambda: choose(page, "Latent axes", "principal components"), 0, 0)
-    before = canvas(page)
-    after(dashboard, lambda: tick(page, "Show robot", False), 0, 0)
-    assert (abs(canvas(page) - before).max(axis=2) > 30).mean() > 0.01, "the robot is gone"
-    after(dashboard, lambda: tick(page, "Show robot", True), 0, 0)
-    after(dashboard, lambda: tick(page, "Ghost", False), 0, 0)
-    assert not dashboard.session.choice.view.ghost
-    after(dashboard, lambda: tick(page, "Ghost", True), 0, 0)
 
 
 def test_camera_presets_move_this_browsers_camera(paused: Page, dashboard: Dashboard) -> None:
@@ -369,58 +165,6 @@ def test_scrubbing_speed_and_loop(paused: Page, dashboard: Dashboard) -> None:
     eventually(lambda: not player.loop, "the loop is off")
     tick(page, "loop", True)
     eventually(lambda: player.loop and player.speed == 1.0, "all is as before")
-
-
-def test_a_failing_change_says_why_and_keeps_the_last_good_state(paused: Page, dashboard: Dashboard) -> None:
-    page = paused
-    tab(page, "View")
-    after(dashboard, lambda: choose(page, "Latent axes", "dimensions"), 0, 0)
-    good = dashboard.session.choice
-    choose(page, "Axis y", "z0")
-    page.locator(".mv-error", has_text="three different latent dimensions").wait_for()
-    assert page.locator(".mantine-Notification-root", has_text="could not be done").count() == 1
-    assert dashboard.session.choice is good and dashboard.session.error is not None
-    choose(page, "Axis y", "z1")
-    eventually(lambda: page.locator(".mv-error").count() == 0, "the message goes away")
-    after(dashboard, lambda: choose(page, "Latent axes", "principal components"), 0, 0)
-
-
-def test_values_that_no_widget_offers_are_refused(paused: Page, dashboard: Dashboard) -> None:
-    """viser takes whatever a websocket sends: the session must not."""
-    page = paused
-    tab(page, "Robot")
-    good = shown(dashboard)
-    send = "([uuid, value]) => window.__viserMutable.sendMessage({type: 'GuiUpdateMessage', uuid, updates: {value}})"
-    by_label = {label: uuid for label, (uuid, _) in widgets(dashboard).items()}
-    page.evaluate(send, [by_label["Controller"], "rm -rf"])
-    eventually(lambda: dashboard.session.error, "the unknown controller is refused")
-    assert "Controller 'rm -rf' is unknown; valid: base-ik, mild, mild-ik" in str(dashboard.session.error)
-    assert shown(dashboard) is good
-    after(dashboard, lambda: choose(page, "Controller", "mild"), 0, 1)
-    after(dashboard, lambda: choose(page, "Controller", "mild-ik"), 0, 1)
-    rollout = after(dashboard, lambda: page.evaluate(send, [by_label["Smoothing"], 1e6]), 0, 1)
-    assert dashboard.session.choice is not None
-    assert dashboard.session.choice.settings.control.smoothing == 1.0 and np.isfinite(rollout.joints_commanded).all()
-    after(dashboard, lambda: slide(page, "Smoothing", "0.8"), 0, 1)
-
-
-def test_a_dragged_slider_neither_floods_nor_blocks(paused: Page, dashboard: Dashboard) -> None:
-    page, session = paused, dashboard.session
-    tab(page, "Robot")
-    track = row(page, "λq").locator(".mantine-Slider-track").bounding_box()
-    assert track is not None
-    before = session.n_control, session.n_infer
-    page.mouse.move(track["x"] + 2, track["y"] + track["height"] / 2)
-    page.mouse.down()
-    for i in range(15):
-        page.mouse.move(track["x"] + (i + 1) / 15 * track["width"], track["y"] + track["height"] / 2)
-    page.mouse.up()
-    eventually(
-        lambda: session.choice is not None and session.choice.settings.control.lambda_q == 100.0, "the last wins"
-    )
-    assert session.wait_idle() and session.error is None
-    assert 1 <= session.n_control - before[0] <= 16 and session.n_infer == before[1]
-    after(dashboard, lambda: slide(page, "λq", "-2"), 0, 1)
 
 
 def test_recordings_are_downloaded_and_open(
