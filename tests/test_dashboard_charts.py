@@ -28,7 +28,7 @@ def segments(lane: ElementTree.Element, css: str) -> list[tuple[float, float, st
 
 
 def points(line: ElementTree.Element) -> np.ndarray:
-    return np.array([pair.split(",") for pair in str(line.get("points")).split()], dtype=float)
+    return np.array(str(line.get("points")).split(), dtype=float).reshape(-1, 2)
 
 
 def test_every_lane_is_well_formed_and_has_a_cursor() -> None:

@@ -79,8 +79,9 @@ def _line(values: Float[np.ndarray, " N"], low: float, high: float, css: str = "
     lines = []
     for start, end, valid in runs(np.isfinite(y)):
         if valid:
-            pairs = np.stack([x[start:end], y[start:end]], axis=1).round().astype(int).tolist()
-            points = " ".join([f"{a},{b}" for a, b in pairs])
+            pairs = np.stack([x[start:end], y[start:end]], axis=1).round().astype(int)
+            # Python's own text of a list: SVG takes the numbers in any separation, and this is the quickest.
+            points = str(pairs.ravel().tolist())[1:-1].replace(",", "")
             lines.append(f'<polyline{style} points="{points}"/>')
     return "".join(lines)
 

@@ -100,7 +100,9 @@ class RobotView:
         for i, handle in self._ghost.items():
             handle.color = colors.prediction
             handle.visible = i in frames.ghost_moving
-        self._pose(self._solid, range(frames.poses.shape[1]), frames.poses[0])
+        # Those that move follow with the frame.
+        still = tuple(i for i in range(frames.poses.shape[1]) if i not in frames.moving)
+        self._pose(self._solid, still, frames.poses[0])
         self._title.position = self._caption.position = top + np.array([0.0, 0.0, 0.13])
         self._caption.text = f"{controller} command"
 
@@ -116,7 +118,7 @@ class RobotView:
             self._pose(self._ghost, frames.ghost_moving, frames.ghost_poses[n])
 
     def _pose(
-        self, handles: dict[int, viser.GlbHandle] | dict[int, viser.MeshHandle], links: range | tuple[int, ...],
+        self, handles: dict[int, viser.GlbHandle] | dict[int, viser.MeshHandle], links: tuple[int, ...],
         poses: Float[np.ndarray, "L 7"],
     ) -> None:  # fmt: skip
         for i in links:
