@@ -137,7 +137,8 @@ class LatentView:
         tints = [np.tile(colors.grid_section, (len(lines[0]), 2, 1)), np.tile(colors.frame, (len(lines[1]), 2, 1))]
         self._line("box", np.concatenate(lines), np.concatenate(tints).astype(np.uint8), 1.0)
         offset = HALF + 0.085
-        spots = ((0.0, -offset, -offset), (offset, 0.0, -offset), (-offset, -offset, 0.0))
+        # The upright axis carries its name high: at half height it would meet the note beside the human's hips.
+        spots = ((0.0, -offset, -offset), (offset, 0.0, -offset), (-offset, -offset, 0.55 * HALF))
         for handle, text, spot in zip(self._axis_labels, projection.labels, spots, strict=True):
             handle.text, handle.position = text, spot
         self._title.position = self._caption.position = (0.0, 0.0, HALF + 0.16)
