@@ -113,7 +113,7 @@ def data_check(path: tyro.conf.Positional[Path]) -> None:
 
 
 def train(
-    out: Path,
+    out: OptionalPath = None,
     dataset: str = "demo",
     stage: Literal["hhi", "hri"] = "hri",
     variant: tuple[VariantName, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
@@ -130,7 +130,8 @@ def train(
     Example: mild-viz train --dataset nuisi --out runs/nuisi --variant v3.1 v3.2 --seeds 8
 
     Args:
-        out: Folder to write the model to; it holds the state of an unfinished run, too. Example: --out runs/mine
+        out: Folder to write the model to; the state of an unfinished run lies beside it. Default: runs/DATASET-STAGE.
+            Example: --out runs/mine
         dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset nuisi
         stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
         variant: Variants to train, one or several. Example: --variant v3.1 v3.2
@@ -141,7 +142,12 @@ def train(
     """
     from mild_viz.training.run import train as run
 
-    run(dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume, seed=seed)
+    out = out or Path("runs") / f"{dataset}-{stage}"
+    made = run(
+        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume, seed=seed
+    )
+    print(f"{out}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
+    print(f"next: mild-viz evaluate --checkpoint {out} --dataset {dataset}")
 
 
 def evaluate(

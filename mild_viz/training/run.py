@@ -107,6 +107,7 @@ def train(
     chosen = candidates[best]
     command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
     command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
+    command += ["--seed", str(seed)] if seed else []
     command += ["--out", f"{out.parent.name}/{out.name}"]
     training = {
         "command": shlex.join(command),
