@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from mild_viz.errors import UserError
+from mild_viz.files import write_atomically
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
 from mild_viz.settings import VARIANTS, WINDOW, Placement, Variant, choose
@@ -270,12 +271,6 @@ def save_contact_states(checkpoint: Checkpoint, action: str, states: frozenset[i
     _check_states(checkpoint, action, states, f"checkpoint {checkpoint.name}")
     saved = {**_read_contact_states(checkpoint), action: states}
     file = checkpoint.path / CONTACT_STATES
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps({key: sorted(value) for key, value in saved.items()}, indent=2) + "\n")
-        os.replace(temporary, file)
-    except OSError as error:
-        raise UserError(f"{file} cannot be written: {error.strerror}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = json.dumps({key: sorted(value) for key, value in saved.items()}, indent=2) + "\n"
+    write_atomically(file, lambda temporary: temporary.write_text(text))
     return replace(checkpoint, contact_states={**checkpoint.contact_states, action: states})

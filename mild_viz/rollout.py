@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mild_viz.files import write_atomically
 from mild_viz.settings import Placement
 from mild_viz.trial import Skeleton, freeze_arrays
 
@@ -127,10 +127,10 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write the arrays named in `SAVED` to an .npz file, atomically."""
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            with open(temporary, "wb") as file:
-                np.savez_compressed(file, **{name: self.array(name) for name in SAVED})  # pyright: ignore[reportArgumentType]
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        arrays = {name: self.array(name) for name in SAVED}
+
+        def write(temporary: Path) -> None:
+            with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name
+                np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+        write_atomically(path, write)

@@ -158,7 +158,7 @@ def test_a_folder_that_cannot_be_written_says_so(folder: Path, monkeypatch: pyte
         raise PermissionError(13, "Permission denied")
 
     model = saved_model(folder)
-    monkeypatch.setattr("mild_viz.checkpoint.os.replace", refuse)
+    monkeypatch.setattr("mild_viz.files.os.replace", refuse)
     with pytest.raises(UserError, match=r"contact_states\.json cannot be written: Permission denied"):
         save_contact_states(model, "handshake", frozenset({1}))
     assert not (folder / "contact_states.json").exists()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import html
 import io
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ import viser._messages
 
 from mild_viz.dashboard.scene.scene import Scene, fill_initial_camera
 from mild_viz.dashboard.view import ViewSettings
+from mild_viz.files import write_atomically
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 
@@ -41,7 +41,8 @@ def record_html(rollout: Rollout, robot: RobotModel, view: ViewSettings, path: P
             scene.set_frame(n)
             recording.insert_sleep(1.0 / rollout.inference.rate)
         page = recording.as_html(dark_mode=view.dark)
-    write_text(path, titled(page, rollout, view.dark))
+    text = titled(page, rollout, view.dark)
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def record_csv(rollout: Rollout, path: Path) -> None:
@@ -65,7 +66,10 @@ def record_csv(rollout: Rollout, path: Path) -> None:
     # Imported here: it costs a third of a second of the start, and most sessions write no table.
     import pandas as pd
 
-    write_text(path, pd.DataFrame(columns).to_csv(index=False, float_format="%.9g", lineterminator="\n"))
+    table = pd.DataFrame(columns)
+    write_atomically(
+        path, lambda temporary: table.to_csv(temporary, index=False, float_format="%.9g", lineterminator="\n")
+    )
 
 
 def titled(page: str, rollout: Rollout, dark: bool) -> str:
@@ -93,13 +97,3 @@ def private_server() -> Iterator[viser.ViserServer]:
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

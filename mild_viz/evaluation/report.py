@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_format
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from rich.table import Table
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.evaluation.metrics import Row, evaluation_rows
+from mild_viz.files import write_atomically
 
 
 def evaluate(checkpoint: Path, dataset: str, json: Path | None = None) -> list[Row]:
@@ -57,9 +57,5 @@ def make_table(rows: Sequence[Row], title: str) -> Table:
 
 def write_json(rows: Sequence[Row], path: Path) -> None:
     """Write {"rows": [...]} to a file, atomically."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json_format.dumps({"rows": [row.as_dict() for row in rows]}, indent=2) + "\n")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = json_format.dumps({"rows": [row.as_dict() for row in rows]}, indent=2) + "\n"
+    write_atomically(path, lambda temporary: temporary.write_text(text))
