@@ -73,6 +73,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         joint_names=interface.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
         observed=observed_rows(mean),
+        tracked=observed_rows(trial.human_arm[newest].reshape(n_windows, -1)),
         log_alpha_human=log_alpha,
         log_alpha_joint=log_alpha_joint,
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),

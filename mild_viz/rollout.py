@@ -40,6 +40,8 @@ class Inference:
     """Time of the newest observation [s]."""
     observed: Bool[np.ndarray, " N"]
     """False where the window could not be filled (tracking lost): the filter then only predicts."""
+    tracked: Bool[np.ndarray, " N"]
+    """False where the newest observation itself was lost: a short gap is bridged by the last one that was seen."""
     log_alpha_human: Float[np.ndarray, "N S"]
     log_alpha_joint: Float[np.ndarray, "N S"]
     log_alpha_unobserved: Float[np.ndarray, "N S"]

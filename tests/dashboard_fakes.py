@@ -51,6 +51,7 @@ def make_inference(n: int = 60, n_states: int = 3, trial: int = 0, **fields: Any
         "joint_names": JOINTS,
         "time": (np.arange(n) + 4) / 30.0,
         "observed": np.ones(n, dtype=bool),
+        "tracked": np.ones(n, dtype=bool),
         "log_alpha_human": log_alpha,
         "log_alpha_joint": log_alpha,
         "log_alpha_unobserved": log_alpha,

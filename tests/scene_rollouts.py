@@ -46,6 +46,7 @@ def scene_inference(
         "joint_names": ("RShoulderPitch", "RShoulderRoll", "RElbowYaw", "RElbowRoll"),
         "time": (np.arange(n) + 4) / trial.rate,
         "observed": np.isfinite(arm).all((1, 2)),
+        "tracked": np.isfinite(arm).all((1, 2)),
         "log_alpha_human": log_alpha,
         "log_alpha_joint": log_alpha,
         "log_alpha_unobserved": np.full((n, n_states), -np.log(n_states)),

@@ -157,6 +157,7 @@ def test_gaps_are_filtered_over(model: Checkpoint, robot: RobotModel, handshake:
     assert np.isnan(inference.human_arm[60 - 4]).all()  # shown as a gap
     assert inference.observed[60 - 4 : 63 - 4].all()  # bridged by the last observation
     assert inference.observed.all() == (length == 3)  # for half a second, no longer
+    np.testing.assert_array_equal(np.flatnonzero(~inference.tracked), np.arange(60 - 4, 60 - 4 + length))
     for array in (inference.log_alpha_human, inference.log_alpha_joint):
         np.testing.assert_allclose(np.exp(array).sum(1), 1.0, atol=1e-12)
     assert np.isfinite(rollout.joints_commanded).all() and np.isfinite(rollout.link_poses).all()
