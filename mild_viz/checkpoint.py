@@ -24,6 +24,7 @@ from mild_viz.trial import ACTIONS
 
 SCHEMA_VERSION = 1
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
+FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
 FEATURES = 18
 """Human features of one frame: three arm joints, position and velocity."""
 
@@ -116,30 +117,85 @@ def _config(checkpoint: Checkpoint) -> dict[str, Any]:
     }
 
 
-def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> None:
-    """Write a checkpoint's folder: built beside its place, then moved there whole.
-
-    Contact states that a person saved in an older folder of the same name are not carried over: they
-    name states of the old model.
-    """
-    path = path.resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+def _read_json(file: Path) -> Any:
     try:
-        building.chmod(0o755)
-        save_file(_tensors(checkpoint), building / WEIGHTS)
-        (building / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
-        (building / CONFIG).write_text(json.dumps(_config(checkpoint), indent=2) + "\n")
-        (building / README).write_text(readme)
-        if path.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-            os.replace(path, old / path.name)
-            os.replace(building, path)
-            shutil.rmtree(old)
-        else:
-            os.replace(building, path)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{file} cannot be read: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, a number of thousands of digits; deep nesting
+        raise UserError(f"{file} is not valid JSON: {error}") from None
+
+
+def check_checkpoint_target(out: Path) -> None:
+    """Refuse a place where saving a checkpoint would delete anything else: the folder is replaced whole.
+
+    Raises:
+        UserError: unless `out` is absent, an empty folder, or holds nothing but a checkpoint's own files.
+    """
+    advice = "choose a new folder with --out"
+    try:
+        found = {entry.name: entry.is_file() for entry in out.iterdir()}
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UserError(f"{out} cannot be a checkpoint folder: {error.strerror or error}; {advice}") from None
+    others = sorted(name for name, is_file in found.items() if name not in FILES or not is_file)
+    if others:
+        raise UserError(
+            f"{out} is not a checkpoint folder: besides a checkpoint's files it holds {', '.join(others[:5])}"
+            f"{' and more' if len(others) > 5 else ''}, which would be deleted; {advice}"
+        )
+    if not found:
+        return
+    config = _read_json(out / CONFIG) if CONFIG in found else None
+    if not isinstance(config, dict) or config.get("schema_version") != SCHEMA_VERSION:
+        raise UserError(
+            f"{out} is not a checkpoint folder: it holds {', '.join(sorted(found))}, but no {CONFIG} "
+            f"with schema_version {SCHEMA_VERSION}; {advice}"
+        )
+
+
+def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoint:
+    """Write a checkpoint's folder, and return it as loaded from there.
+
+    It is built beside its place, loaded to see that it is valid, and then moved there whole. An older
+    checkpoint there is replaced, contact_states.json that a person saved in it included: it names states
+    of the old model.
+
+    Raises:
+        UserError: if `path` holds anything else, cannot be written, or the model is not valid; `path` is
+            then as it was.
+    """
+    check_checkpoint_target(path)
+    try:
+        target = path.resolve()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name[:50]}.", dir=target.parent))
+        built, old = work / "new", work / "old"
+        try:
+            built.mkdir()
+            save_file(_tensors(checkpoint), built / WEIGHTS)
+            (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
+            (built / CONFIG).write_text(json.dumps(_config(checkpoint), indent=2) + "\n", encoding="utf-8")
+            (built / README).write_text(readme, encoding="utf-8")
+            try:
+                loaded = load_checkpoint(built)
+            except UserError as error:
+                raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
+            if target.exists():
+                os.replace(target, old)
+            try:
+                os.replace(built, target)
+            except OSError:
+                if old.exists():
+                    os.replace(old, target)
+                raise
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path} cannot be written: {reason}; choose another place") from None
+    return replace(loaded, path=path)
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -149,10 +205,7 @@ def _read_config(path: Path) -> dict[str, Any]:
             f"{path} is not a checkpoint: expected a folder with {CONFIG} and {WEIGHTS}, "
             "as written by `mild-viz train` or `mild-viz import-published`"
         )
-    try:
-        config = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{file} is not valid JSON: {error}") from None
+    config = _read_json(file)
     if not isinstance(config, dict):
         raise UserError(f"{file} is not a JSON object")
     version = config.get("schema_version")

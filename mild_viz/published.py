@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mild_viz.checkpoint import Checkpoint, RobotInterface, load_checkpoint, save_checkpoint
+from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_target, save_checkpoint
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
@@ -153,8 +153,7 @@ def import_published(file: Path, out: Path) -> Checkpoint:
     Raises:
         UserError: if the file is not such a model, or `out` already holds something else.
     """
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / "config.json").is_file())):
-        raise UserError(f"{out} exists and is not a checkpoint folder; choose a new folder with --out")
+    check_checkpoint_target(out)
     content = read_pth(file)
     try:
         arguments = content["args_r"].state
@@ -188,5 +187,4 @@ def import_published(file: Path, out: Path) -> Checkpoint:
         f"# {out.name}\n\nThe authors' published model, read from `{file.name}`. By its own arguments it is variant "
         f"{variant} (`variant {arguments['variant']}`, `cov_cond {arguments['cov_cond']}`).\n"
     )
-    save_checkpoint(checkpoint, out, readme)
-    return load_checkpoint(out)
+    return save_checkpoint(checkpoint, out, readme)

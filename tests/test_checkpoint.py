@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from mild_viz.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, save_contact_states
+from mild_viz.checkpoint import (
+    Checkpoint,
+    check_checkpoint_target,
+    load_checkpoint,
+    save_checkpoint,
+    save_contact_states,
+)
 from mild_viz.errors import UserError
 from mild_viz.settings import Placement
 from tests.models import random_checkpoint
@@ -51,10 +57,61 @@ def test_a_failing_write_leaves_the_old_folder(folder: Path, monkeypatch: pytest
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("mild_viz.checkpoint.save_file", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(UserError, match=r"model cannot be written: No space"):
         save_checkpoint(random_checkpoint(1), folder, "")
     assert load_checkpoint(folder).name == "random"
     assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_saving_returns_what_loading_gives(tmp_path: Path) -> None:
+    saved = save_checkpoint(random_checkpoint(), tmp_path / "a" / "model", "")
+    assert saved.path == tmp_path / "a" / "model" and saved.actions == load_checkpoint(saved.path).actions
+
+
+def test_a_broken_model_does_not_replace_a_good_one(folder: Path) -> None:
+    before, model = content(folder), random_checkpoint(1)
+    broken = replace(model.hmms["wave"], emission_means=np.full((6, 10), np.nan))
+    with pytest.raises(UserError, match=r"model is left as it was, the new model is not valid: .*emission_means"):
+        save_checkpoint(replace(model, hmms={**model.hmms, "wave": broken}), folder, "")
+    assert content(folder) == before and [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+@pytest.mark.parametrize("name", ["thesis.txt", "weights.safetensors/photo.png", ".git/HEAD"])
+def test_a_folder_with_anything_else_is_not_replaced(folder: Path, name: str) -> None:
+    precious = folder / name
+    if precious.parent.is_file():
+        precious.parent.unlink()
+    precious.parent.mkdir(exist_ok=True)
+    precious.write_text("precious")
+    for attempt in (check_checkpoint_target, lambda out: save_checkpoint(random_checkpoint(1), out, "")):
+        with pytest.raises(UserError, match=rf"model is not a checkpoint folder.* holds {name.split('/')[0]}"):
+            attempt(folder)
+    assert precious.read_text() == "precious"
+
+
+@pytest.mark.parametrize("config", [None, "{}", '{"schema_version": 2}', "[1]", "{"])
+def test_a_folder_with_another_config_is_not_replaced(tmp_path: Path, config: str | None) -> None:
+    (tmp_path / "README.md").write_text("my project")
+    if config is not None:
+        (tmp_path / "config.json").write_text(config)
+    with pytest.raises(UserError, match=r"no config\.json with schema_version 1|config\.json is not valid JSON"):
+        check_checkpoint_target(tmp_path)
+
+
+def test_places_for_a_checkpoint(folder: Path, tmp_path: Path) -> None:
+    check_checkpoint_target(tmp_path / "absent" / "model")
+    (tmp_path / "empty").mkdir()
+    check_checkpoint_target(tmp_path / "empty")
+    (folder / "contact_states.json").write_text('{"wave": [1]}')
+    check_checkpoint_target(folder)
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "model", tmp_path / ("x" * 300), Path("/proc/x")):
+        with pytest.raises(UserError, match=str(place)):
+            save_checkpoint(random_checkpoint(), place, "")
 
 
 def edit_config(folder: Path, **changes: Any) -> None:

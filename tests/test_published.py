@@ -120,6 +120,9 @@ def test_another_archive_is_not_taken_for_a_model(tmp_path: Path) -> None:
 
 def test_an_unrelated_folder_is_not_overwritten(shared: Callable[[str], Path], tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(UserError, match="not a checkpoint folder"):
+    with pytest.raises(UserError, match=r"not a checkpoint folder.*thesis\.txt"):
+        import_published(shared(PUBLISHED), tmp_path)
+    (tmp_path / "config.json").write_text('{"schema_version": 1}')
+    with pytest.raises(UserError, match=r"holds thesis\.txt"):
         import_published(shared(PUBLISHED), tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "precious"

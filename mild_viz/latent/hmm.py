@@ -64,6 +64,9 @@ class HMM:
 
 def check_hmm(hmm: HMM, where: str) -> HMM:
     """Return `hmm` if it is a valid model, else raise an error that says what is wrong."""
+    for name in HMM.__dataclass_fields__:
+        if not np.isfinite(getattr(hmm, name)).all():
+            raise UserError(f"{where}: {name} has values that are not finite")
     if not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6) or (hmm.transition_matrix < 0).any():
         raise UserError(
             f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})"
