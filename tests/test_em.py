@@ -80,3 +80,20 @@ def test_the_floor_keeps_covariances_positive_definite() -> None:
     hmm, _ = fit(equal_segments(flat, 2, 1e-3), flat, 1e-3, 5)
     assert np.linalg.eigvalsh(hmm.emission_covariances).min() >= 1e-3 - 1e-12
     np.testing.assert_allclose(hmm.transition_matrix.sum(1), 1.0)
+
+
+def test_a_transition_that_was_never_seen_stays_possible(data: list[np.ndarray]) -> None:
+    start = equal_segments(data, 3, 1e-2)
+    impossible = HMM(
+        np.array([1.0, 0.0, 0.0]), np.triu(start.transition_matrix) / np.triu(start.transition_matrix).sum(1)[:, None],
+        start.emission_means, start.emission_covariances,
+    )  # fmt: skip
+    for before in (start, impossible):
+        after, _ = em_step(before, data, 1e-2)
+        np.testing.assert_allclose(after.transition_matrix.sum(1), 1.0, atol=1e-12)
+        np.testing.assert_allclose(after.initial_probs.sum(), 1.0, atol=1e-12)
+        backwards = after.transition_matrix[np.tril_indices(3, -1)]
+        np.testing.assert_allclose(backwards, 1e-6, rtol=0.01)
+        np.testing.assert_allclose(after.initial_probs[1:], 1e-6, rtol=0.01)
+    none, _ = em_step(impossible, data, 1e-2, transition_floor=0.0)
+    assert (none.transition_matrix[np.tril_indices(3, -1)] == 0.0).all()
