@@ -107,6 +107,19 @@ def test_suggested_contact_states():
     assert suggest_contact_states(active, rare, 5) == {0}, "relative to the state with the largest share"
 
 
+@pytest.mark.parametrize(("speed", "together"), [(0.45, True), (0.55, False)])
+def test_extended_hands_that_move_apart_are_not_in_contact(speed, together):
+    shoulder = np.array([0.0, -0.18, 0.0])
+    human = np.tile([0.45, -0.18, -0.05], (T, 1))
+    partner = human.copy()
+    partner[:, 1] += np.clip(np.arange(T) - 60, 0, 10) * speed / 30.0  # sideways: as extended as before
+    found = contact_frames(
+        replace(made_trial(), human_arm=reaching(shoulder, human), partner_arm=reaching(shoulder, partner))
+    )
+    assert found[:57].all() and found[74:].all()
+    assert (found[63:68] == together).all()
+
+
 # the estimate
 
 
@@ -172,6 +185,20 @@ def test_recorded_placement_puts_the_robot_in_the_partners_place():
     direction = partner.mean(axis=0) / np.linalg.norm(partner.mean(axis=0))
     np.testing.assert_allclose(hand.mean(axis=0) / np.linalg.norm(hand.mean(axis=0)), direction, atol=0.05)
     np.testing.assert_allclose(placed.T_world_human, T_world_human(CHAIN, placed.placement), atol=1e-12)
+
+
+@pytest.mark.parametrize(("partner_fraction", "fraction"), [(0.6, 0.6), (0.8, 0.8), (0.88, 0.88), (0.97, 0.9)])
+def test_hands_meet_at_the_partners_fraction_of_reach_up_to_nine_tenths(partner_fraction, fraction):
+    shoulder = np.array([0.0, -0.18, 0.0])
+    hand = shoulder + partner_fraction * 0.55 * np.array([0.96, 0.0, -0.28])
+    partner = reaching(shoulder, np.tile(hand, (T, 1)))
+    meeting = APART + FACING @ hand  # in the human's frame
+    human = reaching(meeting + (-0.4, 0.05, 0.1), np.tile(meeting, (T, 1)))
+    trial = replace(made_trial(world=True), human_arm=human, partner_arm=partner)
+    placed = recorded_placement(CHAIN, trial)
+    assert placed is not None and contact_frames(trial).all()
+    found = in_frame(placed.T_world_human, human[:, 2]) - CHAIN.shoulder
+    np.testing.assert_allclose(found, np.tile(fraction * CHAIN.reach * np.array([0.96, 0.0, -0.28]), (T, 1)), atol=1e-6)
 
 
 def test_recorded_placement_does_not_depend_on_the_world():
