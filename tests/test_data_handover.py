@@ -92,7 +92,17 @@ def test_up_axis_is_found_whichever_it_is(tmp_path: Path, up: str) -> None:
         ({"offsets": np.array([0, 20, 39])}, "offsets run from 0 to 39; expected 0 to 40"),
         ({"offsets": np.array([0, 36, 40])}, ".*in steps of at least 10 frames"),
         ({"offsets": np.array([0.0, 40.0])}, "offsets is float64"),
+        ({"offsets": np.array([0, 20, 10, 40], dtype=np.uint64)}, "offsets run from 0 to 40; .*at least 10 frames"),
+        ({"offsets": np.array(40)}, r"offsets is int64 of shape \(\)"),
         ({"rate_hz": np.float32(0.0)}, "rate_hz is 0.0; expected one number above 0"),
+        ({"rate_hz": np.array("fast")}, "rate_hz is fast; expected one number above 0"),
+        ({"rate_hz": np.array(30j)}, "rate_hz is 30j; expected one number above 0"),
+        ({"rate_hz": np.float32(np.nan)}, "rate_hz is nan; expected one number above 0"),
+        (
+            {"receiver": np.full((40, 34, 3), np.nan), "giver": np.full((40, 34, 3), np.nan)},
+            "head and pelvis are tracked",
+        ),
+        ({"receiver": np.full((40, 34, 3), np.nan)}, "train trial 0: a person's own frame needs both shoulders"),
         ({"receiver": np.full((40, 34, 3), np.inf)}, "receiver has an infinite coordinate"),
         ({"giver": np.full((40, 34, 3), 1.0)}, "train trial 0: a person's own frame needs both shoulders"),
     ],
@@ -101,6 +111,21 @@ def test_bad_handover_files_name_file_and_reason(tmp_path: Path, changes: dict[s
     write_handover(tmp_path, **changes)
     with pytest.raises(UserError, match=f"handover/train.npz: {complaint}"):
         read_handover(tmp_path)
+
+
+def test_a_trial_that_begins_with_a_gap_is_read(tmp_path: Path) -> None:
+    write_handover(tmp_path)
+    whole = read_handover(tmp_path)
+    with np.load(tmp_path / "handover" / "train.npz") as file:
+        receiver = file["receiver"]
+    receiver[20] = np.nan
+    receiver[21, ZED_JOINTS.index("neck")] = np.nan
+    write_handover(tmp_path, receiver=receiver)
+    gap, plain = read_handover(tmp_path).trial("train", 1), whole.trial("train", 1)
+    assert gap.T_world_human is not None and plain.T_world_human is not None
+    np.testing.assert_allclose(gap.T_world_human, plain.T_world_human, atol=1e-12)
+    assert np.isnan(gap.human_arm[0]).all()
+    np.testing.assert_allclose(gap.human_arm[1:], plain.human_arm[1:], atol=1e-12)
 
 
 def test_a_recording_in_which_nobody_stands_is_refused(tmp_path: Path) -> None:
@@ -115,7 +140,7 @@ def test_a_recording_in_which_nobody_stands_is_refused(tmp_path: Path) -> None:
 def test_a_persons_frame_is_right_handed_and_faces_forward() -> None:
     T_world_person = person_frame(*np.array([[0.0, 0.2, 1.4], [0.0, -0.2, 1.4], [0.0, 0.0, 0.9], [0.0, 0.0, 1.4]]))
     np.testing.assert_allclose(T_world_person[:3, :3], np.eye(3), atol=1e-12)
-    with pytest.raises(UserError, match="needs both shoulders and the waist"):
+    with pytest.raises(UserError, match="needs both shoulders, the waist and"):
         person_frame(*np.zeros((4, 3)))
     with pytest.raises(UserError, match="no joint 'tail'; it has: head, neck"):
         joint_indices(NUITRACK_JOINTS, ("tail",))

@@ -159,7 +159,7 @@ def test_absent_empty_and_foreign_files_name_file_and_reason(tmp_path: Path) -> 
     with pytest.raises(UserError, match="cannot be read: Is a directory"):
         load_npz(tmp_path)
     (tmp_path / "empty.npz").touch()
-    with pytest.raises(UserError, match="empty.npz is empty"):
+    with pytest.raises(UserError, match=r"^\S*empty.npz is empty; expected an .npz archive$"):
         load_npz(tmp_path / "empty.npz")
     (tmp_path / "text.npz").write_text("<html>404</html>")
     with pytest.raises(UserError, match="text.npz is truncated or not an .npz archive"):
@@ -208,6 +208,16 @@ def test_damaged_members_are_refused(tmp_path: Path) -> None:
         archive.writestr("flat.npy", content.getvalue() + struct.pack("<d", 1.0))
     with pytest.raises(UserError, match="few.npz: array 'flat' holds 8 bytes; its header says 8000"):
         load_npz(tmp_path / "few.npz")
+
+
+@pytest.mark.parametrize("shape", [(0, 2**62), (0, 2**70)])
+def test_a_shape_that_no_array_has_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    content = io.BytesIO()
+    npy.write_array_header_1_0(content, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(tmp_path / "wide.npz", "w") as archive:
+        archive.writestr("flat.npy", content.getvalue())
+    with pytest.raises(UserError, match=r"wide.npz: array 'flat' has shape \(0, \d+\) of float64 in its header, which"):
+        load_npz(tmp_path / "wide.npz")
 
 
 def test_missing_arrays_are_named_beside_those_present(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import unavailable
 
-from mild_viz.data import nuitrack
+from mild_viz.data import commands, nuitrack
 from mild_viz.data.load import load_dataset
 from mild_viz.data.nuisi import RAW_FILES, read_nuisi
 from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices
@@ -135,6 +135,34 @@ def test_bad_nuisi_files_name_file_trial_and_reason(tmp_path: Path, data: Any, l
         read_nuisi(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"train_labels": np.zeros(1, dtype=[("action", "i8")])}, r"train trial 0 has label \(0,\); valid: 0 wave"),
+        ({"train_labels": np.zeros(1, dtype=complex)}, "train trial 0 has label 0j; valid: 0 wave"),
+        ({"train_labels": np.array(0.0)}, r"train_labels is float64 of shape \(\); expected one entry a trial"),
+        ({"train_data": np.array(1.0)}, r"train_data is float64 of shape \(\); expected one entry a trial"),
+        (
+            {"test_data": np.zeros((0, 20, 18))},
+            r"test_data is float64 of shape \(0, 20, 18\); expected one entry a trial",
+        ),
+        ({"test_data": np.zeros((1, 20), dtype=[("x", "f8")])}, r"test trial 0 is \[\('x', '<f8'\)\] of shape \(20,\)"),
+    ],
+)
+def test_arrays_of_another_kind_are_refused_and_listed_as_unusable(
+    tmp_path: Path, changes: dict[str, np.ndarray], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_trials(tmp_path, [np.zeros((20, 18))], [0.0])
+    with np.load(path, allow_pickle=True) as file:
+        arrays: dict[str, Any] = dict(file) | changes
+    np.savez(path, **arrays)
+    for read in (lambda: read_nuisi(tmp_path), lambda: commands.check(path)):
+        with pytest.raises(UserError, match=f"{path}: {complaint}"):
+            read()
+    assert commands.list_datasets(tmp_path) == 1
+    assert "unusable" in capsys.readouterr().out
+
+
 def test_trials_and_labels_must_pair_up(tmp_path: Path) -> None:
     path = write_trials(tmp_path, [np.zeros((20, 18))] * 2, [0.0])
     with pytest.raises(UserError, match=f"{path}: train_data has 2 trials and train_labels 1"):
@@ -198,8 +226,13 @@ def test_lines_of_three_fields_are_lost_frames(tmp_path: Path) -> None:
     assert np.isnan(recording[:, 10]).all()  # a joint that Nuitrack never fills is not at the camera
     (body,) = nuitrack.read_trials(path, ((1, 12),))
     np.testing.assert_array_equal(np.isnan(body.positions).any(axis=(1, 2)), np.arange(11) == 4)
-    with pytest.raises(UserError, match=f"{path}, frames 0 to 12: .*tracked and apart, in the first frame"):
-        nuitrack.read_trials(path, ((0, 12),))
+    # A trial that begins with a lost frame has its own frame from the next one; the gap stays a gap.
+    (later,) = nuitrack.read_trials(path, ((0, 12),))
+    np.testing.assert_array_equal(np.isnan(later.positions).any(axis=(1, 2)), np.isin(np.arange(12), (0, 5)))
+    np.testing.assert_array_equal(later.positions[1:], body.positions)
+    lost = write_recording(tmp_path / "lost.txt", [nuitrack_line(n, None) for n in range(12)])
+    with pytest.raises(UserError, match=f"{lost}, frames 0 to 12: .*tracked and apart in one frame at least"):
+        nuitrack.read_trials(lost, ((0, 12),))
 
 
 @pytest.mark.parametrize(
@@ -210,6 +243,7 @@ def test_lines_of_three_fields_are_lost_frames(tmp_path: Path) -> None:
         (lambda lines: lines[:-1], "has 11 frames; the listed trials need 12: is it truncated"),
         (lambda lines: lines[:3] + lines[4:], "line 4 has frame number 4; expected 3"),
         (lambda lines: [lines[0].replace("0.75", "high")] + lines[1:], "line 1: could not convert string to float"),
+        (lambda lines: [lines[0].replace("0.75", "inf")] + lines[1:], "line 1 holds an infinite number"),
     ],
 )
 def test_damaged_recordings_name_file_and_line(

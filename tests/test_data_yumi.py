@@ -88,6 +88,7 @@ def test_yumi_keeps_every_fifth_frame(tmp_path: Path) -> None:
     [
         (np.zeros((104, 4)), r"labels of shape \(104, 4\); expected \(104, 5\)"),
         (np.zeros((104, 5)), "not one-hot"),
+        (np.zeros((104, 5), dtype=[("x", "f8")]), "has labels of type .*; expected numbers, 0 or 1"),
         (yumi_labels(104, 3, 0), "labelled with the actions none; expected exactly one"),
         (np.concatenate([yumi_labels(52, 0, 52), yumi_labels(52, 1, 52)]), "the actions wave, handshake"),
     ],

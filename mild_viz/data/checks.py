@@ -16,6 +16,9 @@ from mild_viz.errors import UserError
 TRAJECTORY_ARRAYS = ("train_data", "train_labels", "test_data", "test_labels")
 """What a `traj_data.npz` of the authors holds."""
 
+LABELS = ("wave", "handshake", "rocket", "parachute")
+"""Action of each label number in the authors' files."""
+
 
 def file_checksum(*paths: Path) -> str:
     """SHA-256 of the contents of the files, one after the other."""
@@ -27,10 +30,17 @@ def file_checksum(*paths: Path) -> str:
     return digest.hexdigest()
 
 
+def listed(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    """`array`, which must hold one entry a trial: a single number or an empty array raises a `UserError`."""
+    if array.ndim == 0 or len(array) == 0:
+        raise UserError(f"{path}: {name} is {array.dtype} of shape {array.shape}; expected one entry a trial")
+    return array
+
+
 def paired(path: Path, arrays: dict[str, np.ndarray], split: str) -> Iterator[tuple[Any, Any]]:
     """The trials and labels of one split of a `traj_data.npz`, side by side."""
-    data, labels = arrays[f"{split}_data"], arrays[f"{split}_labels"]
-    if len(data) != len(labels) or len(data) == 0:
+    data, labels = (listed(path, name, arrays[name]) for name in (f"{split}_data", f"{split}_labels"))
+    if len(data) != len(labels):
         raise UserError(f"{path}: {split}_data has {len(data)} trials and {split}_labels {len(labels)}; expected equal")
     return zip(data, labels, strict=True)
 

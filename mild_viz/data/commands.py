@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mild_viz.data.checks import TRAJECTORY_ARRAYS
+from mild_viz.data.checks import TRAJECTORY_ARRAYS, listed
 from mild_viz.data.download import fetch as download
 from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
 from mild_viz.data.npz import load_npz
@@ -108,8 +108,8 @@ def _read_npz(path: Path) -> tuple[str, Iterable[Trial]]:
             f"{path} has the arrays {', '.join(arrays) or 'none'}; expected {', '.join(TRAJECTORY_ARRAYS)} "
             f"(NuiSI, HRI-Yumi) or {', '.join(handover.ARRAYS)} (handovers)"
         )
-    data = arrays["train_data"]
-    columns = np.shape(data[0])[-1] if len(data) and np.ndim(data[0]) == 2 else 0
+    data = listed(path, "train_data", arrays["train_data"])
+    columns = np.shape(data[0])[-1] if np.ndim(data[0]) == 2 else 0
     readers = {18: ("NuiSI", nuisi.read_file), 16: ("HRI-Yumi", yumi.read_file)}
     if columns not in readers:
         raise UserError(f"{path}: its trials have {columns} columns; valid: 18 (NuiSI), 16 (HRI-Yumi)")

@@ -2,21 +2,20 @@
 
 The receiver is the human, the giver the partner. Arms are right shoulder, elbow and wrist: of the four pairs
 of wrists it is the two right ones that come closest, in each of the 200 trials. The receiver walks up to the
-giver during a trial, so that the receiver's own frame, which the first frame sets, stays behind;
+giver during a trial, so that the receiver's own frame, which the first tracked frame sets, stays behind;
 `T_world_human` and `T_world_partner` say where the frames are.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from mild_viz.data.checks import file_checksum
 from mild_viz.data.npz import load_npz
-from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, joint_indices, person_frame, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
 from mild_viz.trial import Dataset, Skeleton, Trial
@@ -83,27 +82,33 @@ def _check_body(path: Path, name: str, body: np.ndarray) -> Float[np.ndarray, "N
     return body.astype(np.float64)
 
 
-def _check_layout(path: Path, offsets: Any, rate: Any, *lengths: int) -> tuple[list[int], float]:
+def _check_layout(path: Path, offsets: np.ndarray, rate: np.ndarray, *lengths: int) -> tuple[list[int], float]:
     n_frames = lengths[0]
     if any(length != n_frames for length in lengths):
         raise UserError(f"{path}: receiver and giver have {lengths} frames; expected equal numbers")
     if offsets.ndim != 1 or offsets.dtype.kind not in "iu" or len(offsets) < 2:
         raise UserError(f"{path}: offsets is {offsets.dtype} of shape {offsets.shape}; expected trial limits, integers")
-    if offsets[0] != 0 or offsets[-1] != n_frames or np.diff(offsets).min() < MIN_FRAMES:
+    limits: list[int] = offsets.tolist()  # Python's integers: NumPy's differences wrap around
+    steps = [last - first for first, last in zip(limits[:-1], limits[1:], strict=True)]
+    if limits[0] != 0 or limits[-1] != n_frames or min(steps) < MIN_FRAMES:
         raise UserError(
-            f"{path}: offsets run from {offsets[0]} to {offsets[-1]}; expected 0 to {n_frames} "
+            f"{path}: offsets run from {limits[0]} to {limits[-1]}; expected 0 to {n_frames} "
             f"in steps of at least {MIN_FRAMES} frames"
         )
-    if np.ndim(rate) != 0 or not np.isfinite(rate) or rate <= 0:
+    if rate.ndim != 0 or rate.dtype.kind not in "fiu" or not 0.0 < float(rate) < np.inf:
         raise UserError(f"{path}: rate_hz is {rate}; expected one number above 0")
-    return offsets.tolist(), float(rate)
+    return limits, float(rate)
 
 
 def _turn_upright(path: Path, bodies: Float[np.ndarray, "N 34 3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings the recording's up axis, along which people stand, to z."""
     head, pelvis = joint_indices(ZED_JOINTS, ("head", "pelvis"))
-    upward = np.nanmean(bodies[:, head] - bodies[:, pelvis], axis=0)
-    upward /= np.linalg.norm(upward)
+    upright = bodies[:, head] - bodies[:, pelvis]
+    upright = upright[np.isfinite(upright).all(axis=1)]
+    if len(upright) == 0:
+        raise UserError(f"{path}: head and pelvis are tracked in no frame; expected them, to know which way is up")
+    upward = upright.mean(axis=0)
+    upward /= max(float(np.linalg.norm(upward)), np.finfo(float).tiny)
     axis = int(np.abs(upward).argmax())
     if not abs(upward[axis]) > MIN_UPRIGHT:
         raise UserError(
@@ -114,6 +119,6 @@ def _turn_upright(path: Path, bodies: Float[np.ndarray, "N 34 3"]) -> Float[np.n
 
 
 def _own_frame(body: Float[np.ndarray, "T 34 3"]) -> tuple[Float[np.ndarray, "4 4"], Skeleton]:
-    """T_world_person from the first frame, and the body in that frame."""
-    T_world_person = person_frame(*body[0, joint_indices(ZED_JOINTS, REFERENCE_JOINTS)])
+    """T_world_person from the first frame in which the person is tracked, and the body in it."""
+    T_world_person = first_person_frame(body, joint_indices(ZED_JOINTS, REFERENCE_JOINTS))
     return T_world_person, Skeleton(ZED_JOINTS, ZED_BONES, to_frame(T_world_person, body))

@@ -84,8 +84,11 @@ def _read_member(path: Path, name: str, content: bytes) -> np.ndarray:
     expected, got = prod(shape) * dtype.itemsize, len(content) - stream.tell()
     if got != expected:
         raise UserError(f"{where} holds {got} bytes; its header says {expected}")
-    array = np.frombuffer(content, dtype, count=prod(shape), offset=stream.tell())
-    return array.reshape(shape, order="F" if fortran_order else "C").copy()
+    try:
+        array = np.frombuffer(content, dtype, count=prod(shape), offset=stream.tell())
+        return array.reshape(shape, order="F" if fortran_order else "C").copy()
+    except (ValueError, OverflowError) as error:  # a size of 0 hides any other, however large, from the count
+        raise UserError(f"{where} has shape {shape} of {dtype} in its header, which no array has: {error}") from error
 
 
 def _unpickle(where: str, stream: io.BytesIO) -> np.ndarray:
@@ -123,6 +126,8 @@ def load_npz(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndarray
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise UserError(f"{path} unpacks to more than {MAX_BYTES >> 30} GiB; expected a smaller archive")
             contents = {entry.removesuffix(".npy"): archive.read(entry) for entry in archive.namelist()}
+    except UserError:
+        raise
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror or error}") from error
     except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError, RuntimeError) as error:

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from mild_viz.data import nuitrack
-from mild_viz.data.checks import TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
+from mild_viz.data.checks import LABELS, TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
 from mild_viz.data.npz import load_npz
 from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices
 from mild_viz.errors import UserError
 from mild_viz.trial import Dataset, Skeleton, Trial
 
-ACTION_OF_LABEL = ("wave", "handshake", "rocket", "parachute")
 RATE = 30.0
 FILE = Path("nuisi/traj_data.npz")
 RAW_FILES = (Path("nuisi/raw/Rocket_p1.txt"), Path("nuisi/raw/Rocket_p2.txt"))
@@ -53,8 +52,9 @@ def _read_split(path: Path, split: str, arrays: dict[str, np.ndarray]) -> list[T
     trials = []
     for index, (data, label) in enumerate(paired(path, arrays, split)):
         where = f"{path}: {split} trial {index}"
-        if np.ndim(label) != 0 or label not in range(len(ACTION_OF_LABEL)):
-            meanings = ", ".join(f"{number} {action}" for number, action in enumerate(ACTION_OF_LABEL))
+        number = np.asarray(label)
+        if number.ndim != 0 or number.dtype.kind not in "fiu" or number not in range(len(LABELS)):
+            meanings = ", ".join(f"{number} {action}" for number, action in enumerate(LABELS))
             raise UserError(f"{where} has label {label}; valid: {meanings}")
         arms = check_trial_array(where, data, 18).reshape(-1, 2, 3, 3)
         trials.append(
@@ -62,7 +62,7 @@ def _read_split(path: Path, split: str, arrays: dict[str, np.ndarray]) -> list[T
                 dataset="nuisi",
                 split=split,
                 index=index,
-                action=ACTION_OF_LABEL[int(label)],
+                action=LABELS[int(number)],
                 rate=RATE,
                 human_arm=arms[:, 0],
                 partner_arm=arms[:, 1],

@@ -12,7 +12,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mild_viz.data.skeletons import NUITRACK_BONES, NUITRACK_IDS, NUITRACK_JOINTS, joint_indices, person_frame, to_frame
+from mild_viz.data.skeletons import (
+    NUITRACK_BONES,
+    NUITRACK_IDS,
+    NUITRACK_JOINTS,
+    first_person_frame,
+    joint_indices,
+    to_frame,
+)
 from mild_viz.errors import UserError
 from mild_viz.trial import Skeleton
 
@@ -51,6 +58,8 @@ def read_recording(path: Path) -> Float[np.ndarray, "F 25 3"]:
             raise UserError(f"{path}, line {frame + 1}: {error}") from error
         if len(values) not in (HEADER_FIELDS, full):
             raise UserError(f"{path}, line {frame + 1} has {len(values)} fields; valid: {HEADER_FIELDS} or {full}")
+        if np.isinf(values).any():
+            raise UserError(f"{path}, line {frame + 1} holds an infinite number; expected finite or nan (a gap)")
         if values[0] != frame:
             raise UserError(f"{path}, line {frame + 1} has frame number {fields[0]}; expected {frame}")
         if len(values) == full:
@@ -60,13 +69,13 @@ def read_recording(path: Path) -> Float[np.ndarray, "F 25 3"]:
 
 
 def upper_body(positions: Float[np.ndarray, "T 25 3"]) -> Skeleton:
-    """The upper body of one trial in the person's own frame, which the trial's first frame sets.
+    """The upper body of one trial in the person's own frame, which the first tracked frame sets.
 
-    Origin at the collar, axes from the torso. Raises a `UserError` if the first frame was not tracked.
+    Origin at the collar, axes from the torso. Raises a `UserError` if no frame was tracked.
     """
     body = positions[:, NUITRACK_IDS]
     reference = joint_indices(NUITRACK_JOINTS, ("left_shoulder", "right_shoulder", "waist", "right_collar"))
-    T_world_person = person_frame(*body[0, reference])
+    T_world_person = first_person_frame(body, reference)
     return Skeleton(NUITRACK_JOINTS, NUITRACK_BONES, to_frame(T_world_person, body))
 
 

@@ -84,13 +84,21 @@ def person_frame(
     lengths = np.linalg.norm(y), np.linalg.norm(x)
     if not np.isfinite(lengths).all() or min(lengths) < 1e-6:
         raise UserError(
-            "a person's own frame needs both shoulders and the waist, tracked and apart, in the first frame"
+            "a person's own frame needs both shoulders, the waist and the neck or collar, "
+            "tracked and apart in one frame at least"
         )
     y, x = y / lengths[0], x / lengths[1]
     T_world_person = np.eye(4)
     T_world_person[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
     T_world_person[:3, 3] = origin
     return T_world_person
+
+
+def first_person_frame(body: Float[np.ndarray, "T K 3"], reference: list[int]) -> Float[np.ndarray, "4 4"]:
+    """`person_frame` from the first frame in which all four `reference` joints of a body [m] are tracked."""
+    joints = body[:, reference]
+    tracked = np.isfinite(joints).all(axis=(1, 2))
+    return person_frame(*joints[tracked.argmax()])
 
 
 def to_frame(T_world_frame: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from mild_viz.data.checks import TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
+from mild_viz.data.checks import LABELS, TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
 from mild_viz.data.npz import load_npz
 from mild_viz.errors import UserError
 from mild_viz.trial import Dataset, Trial
 
 FILE = Path("buetepage_hr/traj_data.npz")
-ACTION_OF_LABEL = ("wave", "handshake", "rocket", "parachute")
-NOT_ACTIVE = len(ACTION_OF_LABEL)
+NOT_ACTIVE = len(LABELS)
 """Fifth label: the hands have come to rest at the end of the trial."""
 
 LOG_RATE = 40.0
@@ -81,11 +80,13 @@ def _read_labels(where: str, labels: Any, n_frames: int) -> tuple[str, Int[np.nd
     one_hot = np.asarray(labels)
     if one_hot.shape != (n_frames, NOT_ACTIVE + 1):
         raise UserError(f"{where} has labels of shape {one_hot.shape}; expected {(n_frames, NOT_ACTIVE + 1)}")
+    if one_hot.dtype.kind not in "fiub":
+        raise UserError(f"{where} has labels of type {one_hot.dtype}; expected numbers, 0 or 1")
     if not (np.isin(one_hot, (0, 1)).all() and (one_hot.sum(axis=1) == 1).all()):
         raise UserError(f"{where} has labels that are not one-hot; expected one 1 and four 0 in every row")
     label = one_hot.argmax(axis=1)
     actions = np.unique(label[label != NOT_ACTIVE])
     if len(actions) != 1:
-        names = ", ".join(ACTION_OF_LABEL[number] for number in actions) or "none"
+        names = ", ".join(LABELS[number] for number in actions) or "none"
         raise UserError(f"{where} is labelled with the actions {names}; expected exactly one")
-    return ACTION_OF_LABEL[actions[0]], (label != NOT_ACTIVE).astype(np.int64)
+    return LABELS[actions[0]], (label != NOT_ACTIVE).astype(np.int64)
