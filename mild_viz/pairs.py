@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, pair_windows
 from mild_viz.errors import UserError
 from mild_viz.robot.retarget import retarget_pepper
+from mild_viz.robot.robots import PEPPER_JOINTS
 from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
 
@@ -30,6 +31,11 @@ class Windows:
     actions: tuple[str, ...]
     """Action of each trial."""
 
+    @property
+    def complete(self) -> Bool[np.ndarray, " R"]:
+        """Rows without a gap: those that a loss or an error can be taken on."""
+        return np.logical_and.reduce(np.isfinite(np.concatenate([self.human, self.partner], axis=1)), axis=1)
+
     def rows(self, trial: int) -> slice:
         """The rows of one trial."""
         first, last = np.searchsorted(self.trial, [trial, trial + 1])
@@ -39,11 +45,14 @@ class Windows:
 def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "T J"]:
     """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to Pepper.
 
-    NaN where the partner was not tracked for longer than a gap that is filled, or where no truth is known.
+    NaN where the partner was not tracked for longer than a gap that is filled.
+
+    Raises:
+        UserError: if the trial shows no motion for these joints.
     """
     if trial.robot_joints is not None and tuple(trial.robot_joint_names) == tuple(joint_names):
         return trial.robot_joints
-    if trial.partner_arm is not None and len(joint_names) == 4:
+    if trial.partner_arm is not None and tuple(joint_names) == PEPPER_JOINTS:
         return retarget_pepper(fill_gaps(trial.partner_arm, max_gap(trial.rate)))
     raise UserError(
         f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "

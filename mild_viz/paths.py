@@ -26,8 +26,8 @@ def default_checkpoint(dataset: str) -> Path:
     """The shipped model for a dataset. Raises UserError where none ships for it."""
     if dataset not in SHIPPED_MODELS:
         raise UserError(
-            f"no model ships for dataset '{dataset}'; give one with --checkpoint, trained by: "
-            f"mild-viz train --dataset {dataset} (models ship for {', '.join(SHIPPED_MODELS)})"
+            f"no model ships for dataset '{dataset}' (models ship for {', '.join(SHIPPED_MODELS)}); give one with "
+            "--checkpoint, or see the datasets with: mild-viz data list"
         )
     return checkpoints() / SHIPPED_MODELS[dataset]
 

@@ -147,6 +147,11 @@ def test_the_demo_model_beats_a_constant() -> None:
     assert {row.model for row in rows} == {*VARIANTS, *BASELINES}
 
 
+def test_rows_name_the_dataset_that_was_measured() -> None:
+    rows = model_rows(load_checkpoint(default_checkpoint("nuisi")), load_dataset("demo").test)
+    assert {row.dataset for row in rows} == {"demo"}
+
+
 def test_the_json_has_the_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate(default_checkpoint("demo"), "demo", tmp_path / "demo.json")
     rows = json.loads((tmp_path / "demo.json").read_text())["rows"]

@@ -16,6 +16,7 @@ from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import unobserved_forward
+from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
 from mild_viz.settings import VARIANTS
@@ -153,10 +154,20 @@ def test_a_killed_run_goes_on_to_the_same_result(
         if name == stage and epoch == 2:
             raise Interrupted
 
-    whole = go(RunState(tmp_path / "whole", {}, QUICK, resume=False), silent)
+    undisturbed = RunState(tmp_path / "whole", {}, QUICK, resume=False)
+    whole = go(undisturbed, silent)
+    undisturbed.finish()
+    state = RunState(tmp_path / "killed", {}, QUICK, resume=False)
     with pytest.raises(Interrupted):
-        go(RunState(tmp_path / "killed", {}, QUICK, resume=False), kill)
-    resumed = go(RunState(tmp_path / "killed", {}, QUICK, resume=True), silent)
+        go(state, kill)
+    with pytest.raises(UserError, match="held by another run"):
+        RunState(tmp_path / "killed", {}, QUICK, resume=True)
+    state.release()  # as the end of the process does, however it ends
+    with pytest.raises(UserError, match="unfinished run: go on with --resume"):
+        RunState(tmp_path / "killed", {}, QUICK, resume=False)
+    again = RunState(tmp_path / "killed", {}, QUICK, resume=True)
+    resumed = go(again, silent)
+    again.finish()
     for one, two in zip(whole, resumed, strict=True):
         for name, value in one["v3.1"].weights.items():
             np.testing.assert_array_equal(value, two["v3.1"].weights[name], err_msg=name)
@@ -165,8 +176,8 @@ def test_a_killed_run_goes_on_to_the_same_result(
 def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nothing to resume"):
         RunState(tmp_path / "run", {"dataset": "demo"}, QUICK, resume=True)
-    RunState(tmp_path / "run", {"dataset": "demo"}, QUICK, resume=False)
-    with pytest.raises(UserError, match="differs in dataset"):
+    RunState(tmp_path / "run", {"dataset": "demo"}, QUICK, resume=False).release()
+    with pytest.raises(UserError, match="dataset was demo, asked for is nuisi"):
         RunState(tmp_path / "run", {"dataset": "nuisi"}, QUICK, resume=True)
 
 
@@ -218,9 +229,44 @@ def test_wrong_options_are_named(tmp_path: Path) -> None:
         train("demo", "all", out=tmp_path / "x")
     with pytest.raises(UserError, match="variant 'v7' is unknown"):
         train("demo", variants=("v7",), out=tmp_path / "x")
-    with pytest.raises(UserError, match="must be at least 1"):
+    with pytest.raises(UserError, match="seeds is 0; valid: 1 to 256"):
         train("demo", seeds=0, out=tmp_path / "x")
     (tmp_path / "notes.txt").write_text("precious")
-    with pytest.raises(UserError, match="not a checkpoint folder"):
+    with pytest.raises(UserError, match="notes"):
         train("demo", out=tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_damaged_state_is_named(tmp_path: Path) -> None:
+    state = RunState(tmp_path / "run", {}, QUICK, resume=False)
+    (state.folder / "human.pt").write_bytes(b"half a fi")
+    with pytest.raises(UserError, match=r"human\.pt is damaged"):
+        state.load("human")
+    state.release()
+    (state.folder / "run.json").write_text("[]")
+    with pytest.raises(UserError, match=r"run\.json is damaged"):
+        RunState(tmp_path / "run", {}, QUICK, resume=True)
+
+
+def test_a_diverged_seed_is_never_chosen() -> None:
+    held = hold_out(load_dataset("demo").train, 1)[1]
+    good = random_checkpoint(0)
+    weights = {name: np.full_like(value, np.nan) for name, value in good.robot_vae("v3.1").weights.items()}
+    broken = replace(good, robot_vaes={**good.robot_vaes, "v3.1": VAE(weights)})
+    assert choose_seed([broken, good], held)[0] == 1
+    with pytest.raises(UserError, match="every seed diverged"):
+        choose_seed([broken, broken], held)
+
+
+def test_recordings_without_contact_or_without_any_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = load_dataset("demo")
+    waves = replace(whole, train=tuple(t for t in whole.train if t.action == "wave")[:3], test=whole.test)
+    monkeypatch.setattr(training_run, "load_dataset", lambda _: waves)
+    made = train("demo", "hri", ("v3.1",), seeds=1, epochs=1, out=tmp_path / "waves")
+    assert made.placement is None and made.actions == ("wave",)
+
+    unseen = [replace(t, human_arm=np.full_like(t.human_arm, np.nan)) for t in waves.train]
+    monkeypatch.setattr(training_run, "load_dataset", lambda _: replace(waves, train=tuple(unseen)))
+    with pytest.raises(UserError, match="action 'wave' has no complete window"):
+        train("demo", "hri", ("v3.1",), seeds=1, epochs=1, out=tmp_path / "unseen")
+    assert [p.name for p in tmp_path.iterdir()] == ["waves"]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
+from mild_viz.errors import UserError
 from mild_viz.evaluation.baselines import BASELINES, Examples
 from mild_viz.evaluation.paper import paper_rows
 from mild_viz.latent.gmr import condition
@@ -69,18 +70,23 @@ def predict_windows(checkpoint: Checkpoint, variant: str, data: Windows) -> Floa
 
 def _summaries(dataset: str, model: str, data: Windows, predicted: np.ndarray, human_human: bool) -> list[Row]:
     errors = window_errors(predicted, data.partner, human_human)
+    complete = data.complete
     rows = []
     for action in dict.fromkeys(data.actions):
         trials = [trial for trial, of in enumerate(data.actions) if of == action]
-        pooled = np.concatenate([errors[data.rows(trial)] for trial in trials])
-        pooled = pooled[~np.isnan(pooled)]
+        # Only windows with a gap are left out: a prediction that is not a number must show.
+        pooled = np.concatenate([errors[data.rows(trial)][complete[data.rows(trial)]] for trial in trials])
+        if not len(pooled):
+            raise UserError(f"{dataset}: no complete window of action '{action}' to measure; check the recordings")
         rows.append(Row(dataset, model, action, float(pooled.mean()), float(pooled.std()), len(pooled), len(trials)))
     return rows
 
 
 def _examples(data: Windows, action: str) -> Examples:
     of_action = np.array([of == action for of in data.actions])[data.trial]
-    keep = of_action & ~np.isnan(data.human).any(1) & ~np.isnan(data.partner).any(1)
+    keep = of_action & data.complete
+    if not keep.any():
+        raise UserError(f"no complete window of action '{action}' to fit or to measure; check the recordings")
     return Examples(data.human[keep], data.partner[keep], data.step[keep], data.trial[keep])
 
 
@@ -98,14 +104,14 @@ def baseline_rows(dataset: str, train: Windows, test: Windows, human_human: bool
 
 
 def model_rows(checkpoint: Checkpoint, trials: Sequence[Trial]) -> list[Row]:
-    """Every variant of a checkpoint on the given trials."""
+    """Every variant of a checkpoint on the given trials of one dataset."""
     human_human = checkpoint.robot is None
     data = stack_windows(trials, checkpoint.robot.joint_names if checkpoint.robot else None)
     variants = ("v1",) if human_human else checkpoint.variants
     rows = []
     for variant in variants:
         predicted = predict_windows(checkpoint, variant, data)
-        rows += _summaries(checkpoint.dataset, variant, data, predicted, human_human)
+        rows += _summaries(trials[0].dataset, variant, data, predicted, human_human)
     return rows
 
 

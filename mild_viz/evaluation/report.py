@@ -27,6 +27,8 @@ def evaluate(checkpoint: Path, dataset: str, json: Path | None = None) -> list[R
     unit = "rad^2" if model.robot is not None else "m^2 x 100 (the paper's 'cm')"
     title = f"{model.name} on {source.name} (test split): mean squared error in {unit}, mean ± std over windows"
     Console(width=None if Console().is_terminal else 160).print(make_table(rows, title))
+    if model.dataset == source.name and model.dataset_checksum and model.dataset_checksum != source.checksum:
+        print(f"note: the recordings of '{source.name}' have changed since this model was trained")
     if model.dataset != source.name:
         print(f"note: this model was trained on '{model.dataset}', not on '{source.name}'")
     if json is not None:

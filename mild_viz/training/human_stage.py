@@ -100,7 +100,7 @@ def standardisation(x: np.ndarray) -> tuple[Tensor, Tensor]:
 
 def complete_rows(data: Windows) -> Windows:
     """The rows without a gap: those that a loss can be taken on."""
-    keep = ~(np.isnan(data.human).any(1) | np.isnan(data.partner).any(1))
+    keep = data.complete
     return Windows(data.human[keep], data.partner[keep], data.trial[keep], data.step[keep], data.actions)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mild_viz.errors import UserError
+
 
 @dataclass(frozen=True)
 class TrainingOptions:
@@ -32,3 +34,10 @@ class TrainingOptions:
     gradient_clip: float = 10.0
     held_out: int = 1
     """Trials of every action that are kept from training, to choose among the seeds."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("seeds", 256), ("human_epochs", 100_000), ("robot_epochs", 100_000)):
+            if not 1 <= getattr(self, name) <= most:
+                raise UserError(f"{name} is {getattr(self, name)}; valid: 1 to {most}")
+        if not 0 <= self.seed < 2**31:
+            raise UserError(f"seed is {self.seed}; valid: 0 to {2**31 - 1}")

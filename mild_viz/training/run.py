@@ -13,18 +13,19 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mild_viz.checkpoint import Checkpoint, RobotInterface, load_checkpoint, save_checkpoint
+from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_target, save_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
-from mild_viz.pairs import stack_windows
+from mild_viz.latent.vae import VAE
+from mild_viz.pairs import Windows, stack_windows
 from mild_viz.pipeline import NEWEST, infer
 from mild_viz.robot.contact import contact_frames, suggest_contact_states
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.placement import estimate_placement
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import VARIANTS, choose
-from mild_viz.training.human_stage import train_human_stage
+from mild_viz.settings import VARIANTS, Placement, choose
+from mild_viz.training.human_stage import complete_rows, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
@@ -66,7 +67,10 @@ def choose_seed(candidates: Sequence[Checkpoint], held: Sequence[Trial]) -> tupl
         rows = model_rows(candidate, held)
         scores.append({model: mean_error(rows, model) for model in dict.fromkeys(row.model for row in rows)})
     deciding = [name for name in scores[0] if VARIANTS[name].conditional_training != "none"] or list(scores[0])
-    return int(np.argmin([np.mean([score[name] for name in deciding]) for score in scores])), scores
+    means = np.array([np.mean([score[name] for name in deciding]) for score in scores])
+    if np.isnan(means).all():
+        raise UserError("every seed diverged: no prediction on the held-out trials is a number; try another --seed")
+    return int(np.nanargmin(means)), scores
 
 
 def train(
@@ -87,28 +91,26 @@ def train(
     """
     choose("stage", stage, ("hhi", "hri"))
     variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
-    if seeds < 1 or (epochs is not None and epochs < 1):
-        raise UserError(f"seeds is {seeds} and epochs is {epochs}; both must be at least 1")
-    if out.exists() and any(out.iterdir() if out.is_dir() else [out]) and not (out / "config.json").is_file():
-        raise UserError(f"{out} exists and is not a checkpoint folder; choose a new folder with --out")
+    if not variants:
+        raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
     options = TrainingOptions(seeds=seeds, seed=seed)
     if epochs is not None:
         options = replace(options, human_epochs=epochs, robot_epochs=epochs)
+    check_checkpoint_target(out)
     source = load_dataset(dataset)
-    state = RunState(
-        out,
-        {"dataset": dataset, "checksum": source.checksum, "stage": stage, "variants": list(variants)},
-        options,
-        resume,
-    )
+    fit, held = hold_out(source.train, options.held_out)
+    human_data = training_windows(fit, None)
+    robot_data = training_windows(fit, ROBOTS[ROBOT].joint_names) if stage == "hri" else None
+    description = {"dataset": dataset, "checksum": source.checksum, "stage": stage, "variants": list(variants)}
     started = time.monotonic()
-    candidates, held = _train_stages(source, stage, variants, options, state, out)
+    with RunState(out, description, options, resume) as state:
+        candidates = _train_stages(source, human_data, robot_data, variants, options, state, out)
     best, scores = choose_seed(candidates, held)
     chosen = candidates[best]
     command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
     command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
     command += ["--seed", str(seed)] if seed else []
-    command += ["--out", f"{out.parent.name}/{out.name}"]
+    command += ["--out", str(out)]
     training = {
         "command": shlex.join(command),
         "seed": seed,
@@ -119,19 +121,34 @@ def train(
         "options": asdict(options),
     }
     # The test split is read here for the first time, for the record only.
-    test = model_rows(chosen, source.test)
+    test = model_rows(chosen, [trial for trial in source.test if trial.action in chosen.actions])
     metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
-    fitted, _ = hold_out(source.train, options.held_out)
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
         chosen = replace(
             chosen,
-            contact_states=contact_states(chosen, fitted),
-            placement=estimate_placement(load_robot(ROBOT).chain, source.train)[0],
+            contact_states=contact_states(chosen, fit),
+            placement=contact_placement(source.train),
         )
-    save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
+    saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
     state.finish()
-    return load_checkpoint(out)
+    return saved
+
+
+def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
+    """The training windows; an error says which action has none that is complete, before anything is trained."""
+    data = stack_windows(trials, joint_names)
+    whole = set(complete_rows(data).trial.tolist())
+    for action in dict.fromkeys(data.actions):
+        if not any(of == action and trial in whole for trial, of in enumerate(data.actions)):
+            raise UserError(f"action '{action}' has no complete window in the training trials; check the recordings")
+    return data
+
+
+def contact_placement(trials: Sequence[Trial]) -> Placement | None:
+    """Where the human stands by the contact in the training trials; None where they show none."""
+    touching = [trial for trial in trials if contact_frames(trial).any()]
+    return estimate_placement(load_robot(ROBOT).chain, touching)[0] if touching else None
 
 
 def contact_states(checkpoint: Checkpoint, trials: Sequence[Trial]) -> dict[str, frozenset[int]]:
@@ -149,11 +166,15 @@ def contact_states(checkpoint: Checkpoint, trials: Sequence[Trial]) -> dict[str,
 
 
 def _train_stages(
-    source: Dataset, stage: str, variants: Sequence[str], options: TrainingOptions, state: RunState, out: Path
-) -> tuple[list[Checkpoint], list[Trial]]:
-    """Both stages with a progress bar each. Returns one candidate a seed, and the held-out trials."""
-    fit, held = hold_out(source.train, options.held_out)
-    human_data = stack_windows(fit, None)
+    source: Dataset,
+    human_data: Windows,
+    robot_data: Windows | None,
+    variants: Sequence[str],
+    options: TrainingOptions,
+    state: RunState,
+    out: Path,
+) -> list[Checkpoint]:
+    """Both stages (only the first without robot data) with a progress bar each. Returns one candidate a seed."""
     # One thread: two are slower than one for networks of this size.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -165,7 +186,7 @@ def _train_stages(
         with Progress(*columns, console=Console(stderr=True)) as bars:
             tasks = {
                 "human": bars.add_task("human", total=options.human_epochs, values=""),
-                "robot": bars.add_task("robot", total=options.robot_epochs, values="", visible=stage == "hri"),
+                "robot": bars.add_task("robot", total=options.robot_epochs, values="", visible=robot_data is not None),
             }
 
             def progress(name: str, epoch: int, _: int, values: dict[str, float]) -> None:
@@ -173,8 +194,8 @@ def _train_stages(
                 bars.update(tasks[name], completed=epoch, values=text)
 
             humans = train_human_stage(human_data, options, progress, state)
-            if stage == "hri":
-                robot_data = stack_windows(fit, ROBOTS[ROBOT].joint_names)
+            robots: list[dict[str, VAE]] = [{} for _ in humans]
+            if robot_data is not None:
                 robots = train_robot_stage(robot_data, humans, variants, options, progress, state)
     finally:
         torch.set_num_threads(threads)
@@ -187,12 +208,12 @@ def _train_stages(
             dataset_checksum=source.checksum,
             human_vae=human.vae,
             hmms=human.hmms,
-            robot_vaes=robots[index] if stage == "hri" else {},
-            robot=interface if stage == "hri" else None,
+            robot_vaes=robots[index],
+            robot=interface if robot_data is not None else None,
             hidden=options.hidden,
         )
         for index, human in enumerate(humans)
-    ], held
+    ]
 
 
 def _readme(checkpoint: Checkpoint, source: Dataset, scores: Sequence[dict[str, float]], best: int) -> str:
@@ -208,7 +229,7 @@ def _readme(checkpoint: Checkpoint, source: Dataset, scores: Sequence[dict[str, 
         f"the best of {len(scores) or 1} seeds was chosen on {len(checkpoint.training['held_out_trials'])} held-out "
         "training trials. Test split, read once after that:",
         "",
-        f"    mild-viz evaluate --checkpoint checkpoints/{checkpoint.name} --dataset {source.name}",
+        f"    mild-viz evaluate --checkpoint {checkpoint.path} --dataset {source.name}",
         "",
         "| model | " + " | ".join(checkpoint.actions) + " | mean |",
         "|---|" + "---|" * (len(checkpoint.actions) + 1),

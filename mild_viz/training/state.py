@@ -2,55 +2,102 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 
 from mild_viz.errors import UserError
+from mild_viz.files import write_atomically
 from mild_viz.training.options import TrainingOptions
 
 
 class RunState:
-    """A folder beside the output with the run's options and one file of tensors a stage."""
+    """A folder beside the output with the run's options and one file of tensors a stage.
+
+    One run at a time holds it, and an unfinished run is never thrown away unasked.
+    """
 
     def __init__(self, out: Path, description: dict[str, Any], options: TrainingOptions, resume: bool) -> None:
         self.folder = out.resolve().parent / f".{out.name}.training"
-        record = json.loads(json.dumps({**description, "options": asdict(options)}))
-        file = self.folder / "run.json"
-        if resume and file.is_file():
-            before = json.loads(file.read_text())
+        self._record = self.folder / "run.json"
+        record = json.loads(json.dumps({**description, **asdict(options)}))
+        if not resume and self._record.exists():
+            raise UserError(
+                f"{self.folder} holds an unfinished run: go on with --resume, or remove that folder to start anew"
+            )
+        if resume and not self._record.is_file():
+            raise UserError(f"nothing to resume: {self._record} does not exist")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"{self.folder} cannot be made: {error.strerror}; choose another place with --out"
+            ) from None
+        self._lock = self._hold()
+        try:
+            if resume:
+                self._compare(record)
+            else:
+                write_atomically(self._record, lambda temporary: temporary.write_text(json.dumps(record, indent=2)))
+        except UserError:
+            self.release()
+            raise
+
+    def __enter__(self) -> RunState:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def _hold(self) -> IO[bytes]:
+        """Hold the folder until the process ends, however it ends."""
+        lock = open(self.folder / "lock", "wb")  # noqa: SIM115 - held open on purpose
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            raise UserError(f"{self.folder} is held by another run that is still going on") from None
+        return lock
+
+    def _compare(self, record: dict[str, Any]) -> None:
+        try:
+            before = json.loads(self._record.read_text())
             changed = [key for key in record if before.get(key) != record[key]]
-            if changed:
-                was, asked = [before.get(key) for key in changed], [record[key] for key in changed]
-                raise UserError(
-                    f"{file}: the run to resume differs in {', '.join(changed)}: it was {was}, asked for is {asked}; "
-                    "give the same options, or start anew without --resume"
-                )
-            return
-        if resume:
-            raise UserError(f"nothing to resume: {file} does not exist")
-        shutil.rmtree(self.folder, ignore_errors=True)
-        self.folder.mkdir(parents=True)
-        file.write_text(json.dumps(record, indent=2))
+        except (ValueError, AttributeError):
+            raise UserError(f"{self._record} is damaged; remove {self.folder} to start anew") from None
+        if changed:
+            differences = "; ".join(f"{key} was {before.get(key)}, asked for is {record[key]}" for key in changed)
+            raise UserError(
+                f"{self.folder}: the run to resume differs: {differences}; give the same options, or remove that "
+                "folder to start anew"
+            )
 
     def load(self, stage: str) -> dict[str, Any] | None:
         """What was saved last for a stage, if anything."""
         file = self.folder / f"{stage}.pt"
-        return torch.load(file, weights_only=True) if file.is_file() else None
+        if not file.is_file():
+            return None
+        try:
+            return torch.load(file, weights_only=True)
+        except Exception:  # a damaged pickle leads torch into any of a dozen errors
+            raise UserError(f"{file} is damaged; remove {self.folder} to start anew") from None
 
     def save(self, stage: str, content: dict[str, Any]) -> None:
         """Replace a stage's state, atomically."""
-        temporary = self.folder / f".{stage}.{os.getpid()}.tmp"
-        torch.save(content, temporary)
-        os.replace(temporary, self.folder / f"{stage}.pt")
+        write_atomically(self.folder / f"{stage}.pt", lambda temporary: torch.save(content, temporary))
+
+    def release(self) -> None:
+        """Let another run have the folder; what was saved stays."""
+        self._lock.close()
 
     def finish(self) -> None:
         """The result is written: the state is not needed any more."""
+        self.release()
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
