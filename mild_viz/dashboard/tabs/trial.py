@@ -12,7 +12,7 @@ from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.tabs.widgets import Changed, offer, on_person, option, set_content
 from mild_viz.errors import UserError
 from mild_viz.rollout import Rollout
-from mild_viz.settings import VARIANTS, InferSettings
+from mild_viz.settings import VARIANTS, InferSettings, Variant
 from mild_viz.trial import Trial
 
 
@@ -90,6 +90,21 @@ class TrialTab:
                 float(np.sqrt(np.nanmean(np.diagonal(covariance, axis1=1, axis2=2))))
                 for covariance in (inference.human_latent_covariance, inference.human_state_covariances)
             )
-            effect = "so it changes almost nothing here" if posterior < 0.1 * states else "so it matters here"
-            text += f" The posterior's spread is {posterior:.2g}, that of the states {states:.2g}: {effect}."
+            text += f" The posterior's spread is {posterior:.2g}, that of the states {states:.2g}."
+            if posterior < 0.1 * states:
+                text += (
+                    " The covariance itself changes almost nothing here; "
+                    f"differences to {_without_covariance(variant)} come from another trained decoder."
+                )
+            else:
+                text += " So the covariance matters here."
         set_content(self._note, f'<div class="mv-note">{text}</div>')
+
+
+def _without_covariance(variant: Variant) -> str:
+    """The variant that differs in the covariance alone."""
+    return next(
+        other.name
+        for other in VARIANTS.values()
+        if other.conditional_training == variant.conditional_training and not other.posterior_covariance
+    )
