@@ -53,6 +53,8 @@ class ViewTab:
             group: gui.add_checkbox(f"Show {group}", True, hint=f"Draw the {group}.")
             for group in ("human", "robot", "latent plot")
         }
+        self._axis_names = ["z0", "z1", "z2"]
+        """What the axes were at the last reading."""
         widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost)
         for handle in (*widgets, *self._visible.values()):
             on_person(handle, changed)
@@ -64,12 +66,16 @@ class ViewTab:
                 move_camera(event.client, name)
 
     def read(self) -> ViewSettings:
-        """The chosen view. Raises UserError where two axes show the same dimension."""
+        """The chosen view. An axis that takes another one's dimension swaps with it."""
         by_dimension = option(self._axes) == DIMENSIONS
         for handle in self._dimensions:
             if handle.visible != by_dimension:
                 handle.visible = by_dimension
-        names = [option(handle) for handle in self._dimensions]
+        names = swapped(self._axis_names, [option(handle) for handle in self._dimensions])
+        for handle, name in zip(self._dimensions, names, strict=True):
+            if handle.value != name:
+                handle.value = name
+        self._axis_names = names
         if by_dimension and len(set(names)) < len(names):
             raise UserError(f"the axes show {', '.join(names)}; valid: three different latent dimensions")
         x, y, z = (int(name.removeprefix("z")) for name in names)
@@ -88,5 +94,21 @@ class ViewTab:
     def show(self, rollout: Rollout) -> None:
         """Offer the latent dimensions that the model has."""
         n_dimensions = rollout.inference.human_latent_mean.shape[1]
+        names = [f"z{i}" for i in range(n_dimensions)]
         for handle in self._dimensions:
-            offer(handle, (f"z{i}" for i in range(n_dimensions)))
+            offer(handle, names)
+        if not set(self._axis_names) <= set(names):  # of a model with more of them
+            self._axis_names = [names[min(i, n_dimensions - 1)] for i in range(len(self._dimensions))]
+            for handle, name in zip(self._dimensions, self._axis_names, strict=True):
+                handle.value = name
+
+
+def swapped(before: list[str], wanted: list[str]) -> list[str]:
+    """The axes after a choice: whoever had the dimension that an axis takes gets that axis' old one."""
+    axes = list(before)
+    for i, name in enumerate(wanted):
+        if name != before[i]:
+            if name in axes:
+                axes[axes.index(name)] = axes[i]
+            axes[i] = name
+    return axes
