@@ -189,8 +189,12 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
     # inputs that differ by rounding give the same solution to rounding. Where the arm can turn freely about its
     # solution, the step would be large, and is not taken.
     if _bounded_step(arm, hessian, 0.0, gradient, q, step, fixed, factor, rhs):
+        largest = 0.0
         for i in range(n):
-            if not fixed[i] and abs(step[i]) < 1e-6:
+            if not fixed[i]:
+                largest = max(largest, abs(step[i]))
+        for i in range(n):
+            if not fixed[i] and largest < 1e-6:
                 q[i] = min(max(q[i] + step[i], arm[i, LOWER]), arm[i, UPPER])
 
 
