@@ -166,7 +166,7 @@ def test_tracking_lost_for_seconds_is_drawn_as_a_gap(dashboard: Dashboard) -> No
         dashboard.scene.set_frame(frame)
         dashboard._tick(frame, False)
     lanes = dashboard.timeline._lanes
-    assert "mv-lost" in lanes["alpha"].content and "grey: lost" in lanes["alpha"].content
+    assert "mv-lost" in lanes["alpha"].content and "tracking lost" in lanes["joints"].content
     assert all("nan" not in lane.content.lower() for lane in lanes.values())
     dashboard._show(rollout, choice, True)
 

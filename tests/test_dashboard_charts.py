@@ -59,6 +59,12 @@ def test_true_phases_are_a_second_strip_only_where_they_are_known() -> None:
     assert all(name in html for name in ("reach", "contact", "return"))
 
 
+def test_who_waves_is_not_in_contact() -> None:
+    inference = make_inference(n=40, phase=np.repeat([0, 1, 2, 3], 10), action="wave")
+    html = charts.draw_lanes(make_rollout(inference), "human")["states"]
+    assert "waving" in html and ">contact<" not in html
+
+
 def test_alpha_follows_the_chosen_mode() -> None:
     other = np.log(np.tile([0.2, 0.3, 0.5], (60, 1)))
     inference = make_inference(n=60, log_alpha_unobserved=other)
@@ -81,14 +87,17 @@ def test_curves_are_broken_where_data_is_missing() -> None:
     truth = np.ones((60, 4))
     truth[20:30, 1] = np.nan
     truth[:, 2] = np.nan
-    observed = np.ones(60, dtype=bool)
-    observed[10:20] = False
-    html = charts.draw_lanes(make_rollout(make_inference(n=60, joints_truth=truth, observed=observed)), "human")
+    tracked = np.ones(60, dtype=bool)
+    tracked[10:20] = False
+    html = charts.draw_lanes(make_rollout(make_inference(n=60, joints_truth=truth, tracked=tracked)), "human")
     rows = [node for node in parse(html["joints"]).iter("div") if node.get("class") == "mv-row"]
     curves = [[line for line in row.iter("polyline") if line.get("class") == "mv-truth"] for row in rows]
     assert [len(lines) for lines in curves] == [1, 2, 0, 1]
     assert "nan" not in html["joints"].lower()
-    assert html["alpha"].count("mv-lost") == 1
+    assert html["alpha"].count("mv-lost") == html["distance"].count("mv-lost") == 1
+    assert "tracking lost" in html["joints"]
+    before, later = (points(line) for line in parse(html["distance"]).iter("polyline"))
+    assert (before[-1, 0], later[0, 0]) == (round(9 / 59 * charts.WIDTH), round(20 / 59 * charts.WIDTH))
 
 
 def test_a_trial_without_any_truth_or_motion_still_draws() -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import STATE_COLORS
-from mild_viz.trial import PHASES
+from mild_viz.trial import CONTACT_ACTIONS, PHASES
 
 WIDTH, HEIGHT = 1000, 1000
 """Of a picture, in its own units: it is stretched to the lane."""
@@ -52,6 +52,12 @@ def draw_lanes(rollout: Rollout, alpha_mode: str) -> dict[str, str]:
 def cursor_html(fraction: float) -> str:
     """The style that puts the time cursor of all lanes at a fraction (0 to 1) of the trial."""
     return f"<style>.mv-lane{{--mv-time:{100.0 * fraction:.2f}}}</style>"
+
+
+def phase_names(action: str) -> dict[int, str]:
+    """Names of the true phases; where the partners do not touch, the third one is no contact."""
+    names = dict(enumerate(PHASES))
+    return names if action in CONTACT_ACTIONS else {**names, PHASES.index("contact"): "waving"}
 
 
 def runs(values: Int[np.ndarray, " N"] | Bool[np.ndarray, " N"]) -> list[tuple[int, int, int]]:
@@ -137,7 +143,7 @@ def _states(rollout: Rollout) -> str:
     plot, note = strip + contact, ""
     if inference.phase is not None:
         phases = range(len(PHASES))
-        names = dict(enumerate(PHASES))
+        names = phase_names(inference.action)
         plot += _strip(inference.phase, "mv-phase", {p: PHASE_COLORS[p] for p in phases}, {**names, 0: ""})
         note = "true phase"
     css = "mv-states mv-with-phase" if inference.phase is not None else "mv-states"
@@ -148,9 +154,8 @@ def _states(rollout: Rollout) -> str:
 def _alpha(inference: Inference, mode: str) -> str:
     alpha = np.exp(inference.log_alpha(mode))
     lines = "".join(_line(alpha[:, s], -0.03, 1.03, color=state_color(s)) for s in range(inference.n_states))
-    plot = _svg(_grid(inference) + _bands(~inference.observed, "mv-lost") + lines)
-    note = escape(mode) if inference.observed.all() else f"{escape(mode)} · grey: lost"
-    return _lane("Forward variable", note, plot, ("1", "0"))
+    plot = _svg(_grid(inference) + _bands(~inference.tracked, "mv-lost") + lines)
+    return _lane("Forward variable", escape(mode), plot, ("1", "0"))
 
 
 def _joints(rollout: Rollout) -> str:
@@ -158,7 +163,7 @@ def _joints(rollout: Rollout) -> str:
     inference = rollout.inference
     degrees = [np.degrees(x) for x in (inference.joints_truth, inference.joints_decoded, rollout.joints_commanded)]
     n_joints = len(inference.joint_names)
-    background = _grid(inference) + _bands(rollout.contact, "mv-touch")
+    background = _grid(inference) + _bands(rollout.contact, "mv-touch") + _bands(~inference.tracked, "mv-lost")
     rows = []
     for j, name in enumerate(inference.joint_names):
         curves = [values[:, j] for values in degrees]
@@ -178,21 +183,26 @@ def _joints(rollout: Rollout) -> str:
     sample = '<svg viewBox="0 0 22 8"><line class="mv-{}" x1="0" x2="22" y1="4" y2="4"/></svg>'
     key = "".join(f'<span class="mv-key">{sample.format(css)}{css}</span>' for css in ("commanded", "decoded", "truth"))
     key += '<span class="mv-key"><i class="mv-patch"></i>contact states</span>'
+    if not inference.tracked.all():
+        key += '<span class="mv-key"><i class="mv-patch mv-gap"></i>tracking lost</span>'
     head = f'<div class="mv-head"><div class="mv-name">Joint angles</div>{key}</div>'
     cursor = '<div class="mv-over"><div class="mv-cursor"></div></div>'
     return f'<div class="mv-lane mv-joints">{head}<div class="mv-rows">{"".join(rows)}</div>{cursor}</div>'
 
 
 def _distance(rollout: Rollout) -> str:
-    centimetres = 100.0 * rollout.hand_distance
+    """From the robot's hand to the human's wrist, broken where the wrist was not seen."""
+    tracked = rollout.inference.tracked
+    centimetres = np.where(tracked, 100.0 * rollout.hand_distance, np.nan)
     known = centimetres[np.isfinite(centimetres)]
     high = float(known.max()) if len(known) else 1.0
     plot = _svg(
         _grid(rollout.inference)
         + _bands(rollout.contact, "mv-touch")
+        + _bands(~tracked, "mv-lost")
         + _line(centimetres, 0.0, 1.06 * high, "mv-commanded")
     )
-    return _lane("Hand distance", "robot to human", plot, (f"{high:.0f} cm", "0"))
+    return _lane("Hand distance", "robot hand to wrist", plot, (f"{high:.0f} cm", "0"))
 
 
 def tick_times(start: float, end: float) -> list[float]:

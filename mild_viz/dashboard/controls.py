@@ -10,7 +10,7 @@ import viser
 
 from mild_viz.checkpoint import save_contact_states
 from mild_viz.dashboard.catalog import Catalog
-from mild_viz.dashboard.charts import state_color
+from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.record import RecordTab, Writer
@@ -22,6 +22,7 @@ from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.rollout import Rollout
 from mild_viz.settings import InferSettings, Settings
+from mild_viz.trial import CONTACT_ACTIONS
 
 
 class Controls:
@@ -75,7 +76,8 @@ class Controls:
         self._trial.show(rollout)
         self._robot.show(rollout)
         self._states.show(rollout)
-        set_content(self._header, header_html(rollout, choice.checkpoint.name))
+        self._compare_contact_states(rollout.contact_states, choice)
+        set_content(self._header, header_html(rollout, self._model_of(choice)))
 
     def offer_datasets(self) -> None:
         """Complete the list of datasets, which takes reading them."""
@@ -100,6 +102,15 @@ class Controls:
         for client in self._server.get_clients().values():
             client.add_notification("This could not be done", sentence(message), color="red", auto_close_seconds=8.0)
 
+    def _model_of(self, choice: Choice) -> str:
+        """The model's name on the page: a copy of a shipped model calls itself as the original does."""
+        return self._catalog.name_of(choice.checkpoint.path)
+
+    def _compare_contact_states(self, ticked: frozenset[int], choice: Choice) -> None:
+        action = choice.trial.action
+        stored = self._catalog.current(choice.checkpoint).contact_states.get(action, frozenset())
+        self._states.compare(ticked, stored, action, self._model_of(choice))
+
     def _save_contact_states(self) -> None:
         choice = self._choice
         if choice is None:
@@ -112,28 +123,27 @@ class Controls:
         except UserError as error:
             self._states.say_saved(f"Not saved: {error}")
             return
-        names = ", ".join(str(state) for state in sorted(states)) or "none"
-        self._states.say_saved(f"Saved: {names} for {action}, the default of {choice.checkpoint.name} from now on.")
+        self._compare_contact_states(states, choice)
 
 
 def header_html(rollout: Rollout, model: str) -> str:
-    """What is shown, in two lines."""
+    """What is shown, and how well the model itself (not the controller) predicts this trial."""
     inference = rollout.inference
     errors = inference.window_error[np.isfinite(inference.window_error)]
     mse = f"{errors.mean():.4f} rad²" if len(errors) else "unknown (no true motion)"
     return (
         f'<div class="mv-header"><b>{escape(inference.dataset)} · {escape(inference.action)} · '
         f"{escape(inference.split)} {inference.trial}</b><br>"
-        f"model {escape(model)}, variant {escape(inference.variant)}, controller {escape(rollout.controller)}<br>"
-        f"MSE of this trial <b>{mse}</b></div>"
+        f"model {escape(model)}, controller {escape(rollout.controller)}<br>"
+        f"variant {escape(inference.variant)}, MSE of the decoded motion (before IK) <b>{mse}</b></div>"
     )
 
 
 def now_html(rollout: Rollout, frame: int) -> str:
-    """State and distance at the cursor."""
-    state = int(rollout.inference.active_state[frame])
-    phase = "contact" if rollout.contact[frame] else "no contact"
+    """State, stiffness and, where the partners touch, the distance at the cursor."""
+    # Where nobody touches, the distance says nothing about how well it goes.
+    emphasis = "<b>{}</b>" if rollout.inference.action in CONTACT_ACTIONS else "{}"
     return (
-        f'<div class="mv-header mv-live"><span class="mv-swatch" style="background:{state_color(state)}"></span>'
-        f"State <b>{state}</b> · {phase} · hands <b>{100 * rollout.hand_distance[frame]:.1f} cm</b> apart</div>"
+        f'<div class="mv-header mv-live">{state_html(rollout, frame)} · {stiffness_text(rollout, frame)}<br>'
+        f"{distance_html(rollout, frame, emphasis)}</div>"
     )

@@ -66,9 +66,10 @@ TIMELINE_CSS = TIMELINE_CSS.replace("LEFT", str(GUTTER[0]))
 
 CHART_CSS = """
 .mv-now {
-  font-size: 12px; white-space: nowrap; overflow: hidden; text-overflow: ellipsis; text-align: right;
-  padding-right: 10px; color: var(--mantine-color-text); font-variant-numeric: tabular-nums;
+  font-size: 12px; line-height: 14px; overflow: hidden; text-align: right; padding-right: 10px;
+  color: var(--mantine-color-text); font-variant-numeric: tabular-nums;
 }
+.mv-now > span { white-space: nowrap; margin-left: 12px; }
 .mv-lane {
   display: flex; font-size: 11px; line-height: 1.1; color: var(--mantine-color-text); position: relative;
   font-variant-numeric: tabular-nums;
@@ -121,14 +122,15 @@ CHART_CSS = """
 .mv-key svg { position: static; width: 22px; height: 8px; }
 .mv-patch { width: 22px; height: 9px; background: color-mix(in srgb, var(--mantine-color-text) 12%, transparent);
   border-top: 3px solid var(--mantine-color-text); box-sizing: border-box; }
+.mv-patch.mv-gap { background: color-mix(in srgb, var(--mantine-color-dimmed) 35%, transparent); border: none; }
 .mv-key line { stroke-width: 2; }
+""".replace("LEFT", str(GUTTER[0])).replace("RIGHT", str(GUTTER[1]))
+
+PANEL_CSS = """
 .mv-swatch {
   display: inline-block; width: 0.75em; height: 0.75em; border-radius: 2px; margin-right: 0.35em;
   vertical-align: -0.05em;
 }
-""".replace("LEFT", str(GUTTER[0])).replace("RIGHT", str(GUTTER[1]))
-
-PANEL_CSS = """
 .mv-header { padding: 0 12px 6px; font-size: 13px; line-height: 1.45; color: var(--mantine-color-text);
   font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
 .mv-live { padding-bottom: 14px; }

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from html import escape
 
 import viser
 
 from mild_viz.dashboard import charts
 from mild_viz.dashboard.player import SPEEDS, Player
+from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
 from mild_viz.dashboard.style import CHART_CSS, FLOATING_SIZE, TIMELINE_CSS
 from mild_viz.rollout import Rollout
 
@@ -30,7 +30,13 @@ class Timeline:
             self._loop = gui.add_checkbox("loop", player.loop, hint="Start again at the end.")
             self._now = gui.add_html("")
             self._frame = gui.add_slider(
-                "frame", 0, 1, 1, 0, marks=(), hint="Drag to any frame of the trial; the box takes a number."
+                "frame",
+                0,
+                1,
+                1,
+                0,
+                marks=(),
+                hint="Drag the frame bar to any frame; the box takes a number.",
             )
             self._cursor = gui.add_html(charts.cursor_html(0.0))
             self._lanes = {name: gui.add_html('<div class="mv-lane"></div>') for name in charts.LANES}
@@ -118,20 +124,16 @@ class Timeline:
             handle.content = content
 
 
-HINT_TRANSPORT = "Keys: Space plays and pauses, J and K step, Home and End jump."
+HINT_TRANSPORT = "Keys: Space plays and pauses, J and K step, Home and End jump. Or drag the frame bar below."
 
 
 def _now(rollout: Rollout, frame: int) -> str:
-    """What holds at the cursor, in one line."""
-    inference = rollout.inference
-    state = int(inference.active_state[frame])
-    distance = 100.0 * rollout.hand_distance[frame]
-    parts = [
-        f"<b>{inference.time[frame]:.2f} s</b> of {inference.time[-1]:.2f} s",
-        f'<span class="mv-swatch" style="background:{charts.state_color(state)}"></span>state {state}',
-        "contact" if rollout.contact[frame] else "free motion",
-        f"hand distance {distance:.1f} cm",
-    ]
-    if not inference.observed[frame]:
-        parts.append(escape("tracking lost"))
-    return f'<div class="mv-now">{" &nbsp;·&nbsp; ".join(parts)}</div>'
+    """What holds at the cursor, in parts that stay whole where the line must be broken."""
+    time = rollout.inference.time
+    parts = (
+        f"<b>{time[frame]:.2f} s</b> of {time[-1]:.2f} s",
+        state_html(rollout, frame),
+        stiffness_text(rollout, frame),
+        distance_html(rollout, frame),
+    )
+    return f'<div class="mv-now">{" ".join(f"<span>{part}</span>" for part in parts)}</div>'

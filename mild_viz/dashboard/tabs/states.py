@@ -10,6 +10,7 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.charts import state_color
 from mild_viz.dashboard.tabs.widgets import Changed, on_person, set_content, widget_id
 from mild_viz.rollout import Rollout
+from mild_viz.trial import CONTACT_ACTIONS
 
 BOX_CSS = """
 .mantine-Flex-root:has(> div > p > label[for="ID"]) { flex-direction: row-reverse; justify-content: flex-end; }
@@ -61,24 +62,32 @@ class StatesTab:
         if self._of != (checkpoint.human_vae, action):
             self._of = (checkpoint.human_vae, action)
             self.tick(checkpoint.contact_states.get(action, frozenset()))
-            self.say_saved(SAVE_NOTE)
         return frozenset(state for state in range(checkpoint.n_states) if self._boxes[state].value)
 
     def tick(self, states: frozenset[int]) -> None:
         for state, box in enumerate(self._boxes):
             box.value = state in states
 
+    def compare(self, ticked: frozenset[int], stored: frozenset[int], action: str, model: str) -> None:
+        """Say whether the ticked states are what the model has stored; only if not, there is something to save."""
+        names = ", ".join(str(state) for state in sorted(stored)) or "none"
+        self.save.disabled = ticked == stored
+        if ticked == stored:
+            self.say_saved(f"Saved: {names} for {action}, the default of model {model}.")
+        else:
+            self.say_saved(f"Not saved: the default of model {model} for {action} is {names}. {SAVE_NOTE}")
+
     def say_saved(self, text: str) -> None:
         set_content(self._saved, f'<div class="mv-note">{escape(text)}</div>')
 
     def show(self, rollout: Rollout) -> None:
         """Write how long and how often each state is active in this trial."""
-        set_content(
-            self._intro,
-            '<div class="mv-note">States in which the partners touch during '
-            f"<b>{escape(rollout.inference.action)}</b>: there the robot goes for the human's hand. "
-            "Mean visit and share of this trial:</div>",
-        )
+        action = rollout.inference.action
+        if action in CONTACT_ACTIONS:
+            text = f"States of contact in <b>{escape(action)}</b>: there mild-ik goes for the hand."
+        else:
+            text = f"A <b>{escape(action)}</b> has no contact; in a ticked state mild-ik would go for the hand."
+        set_content(self._intro, f'<div class="mv-note">{text} Mean visit and share of this trial:</div>')
         for state in range(rollout.inference.n_states):
             length, share = rollout.state_durations[state], rollout.state_occupancy[state]
             times = f"{length:.2f} s, {100 * share:.0f} %" if share > 0 else "not visited"
