@@ -132,7 +132,7 @@ def train(
     Args:
         out: Folder to write the model to; the state of an unfinished run lies beside it. Default: runs/DATASET-STAGE.
             Example: --out runs/mine
-        dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        dataset: Recordings of two humans to train on: demo, nuisi, handover. Example: --dataset nuisi
         stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
         variant: Variants to train, one or several. Example: --variant v3.1 v3.2
         seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
