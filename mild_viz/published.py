@@ -19,7 +19,7 @@ from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_tar
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
-from mild_viz.settings import WINDOW
+from mild_viz.settings import HUMAN_FEATURES, WINDOW
 
 ACTIONS = ("wave", "handshake", "rocket", "parachute")
 """Order of the authors' HMMs: the labels of the NuiSI file."""
@@ -163,7 +163,7 @@ def import_published(file: Path, out: Path) -> Checkpoint:
             raise UserError(
                 f"{file} drives {n_joints} joints; only Pepper models ({len(PEPPER_JOINTS)}) can be imported"
             )
-        human_vae = _vae(content["model_h"], WINDOW * 18, latent, f"{file}: model_h")
+        human_vae = _vae(content["model_h"], WINDOW * HUMAN_FEATURES, latent, f"{file}: model_h")
         robot_vae = _vae(content["model_r"], WINDOW * n_joints, latent, f"{file}: model_r")
         hmms = {a: _hmm(ssm.state, f"{file}: ssm {a}") for a, ssm in zip(ACTIONS, content["ssm"], strict=True)}
     except (KeyError, AttributeError, TypeError, ValueError) as error:

@@ -9,6 +9,9 @@ from mild_viz.errors import UserError
 WINDOW = 5
 """Observations in one window (Sec. V-B of the paper)."""
 
+HUMAN_FEATURES = 18
+"""Human features of one frame: three arm joints, position and velocity."""
+
 STATE_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C8C8C")
 """Colour of each HMM state, after Okabe and Ito (safe for colour-blind readers)."""
 
@@ -37,6 +40,9 @@ VARIANTS: dict[str, Variant] = {
     )
 }
 
+MAX_PLACEMENT = 100
+"""A human stands nearer than this to the robot, in each direction [m]."""
+
 ALPHA_MODES = ("human", "joint", "unobserved")
 CONTROLLERS = ("base-ik", "mild", "mild-ik")
 
@@ -62,6 +68,15 @@ class Placement:
     height: float
     source: str = "chosen"
     estimated: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "lateral", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < MAX_PLACEMENT:
+                raise UserError(
+                    f"placement: {name} is {value!r}; valid: a number of metres between -{MAX_PLACEMENT} "
+                    f"and {MAX_PLACEMENT}"
+                )
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from mild_viz.checkpoint import (
     save_contact_states,
 )
 from mild_viz.errors import UserError
-from mild_viz.settings import Placement
+from mild_viz.settings import VARIANTS, Placement
 from tests.models import random_checkpoint
 
 
@@ -56,7 +56,7 @@ def test_a_failing_write_leaves_the_old_folder(folder: Path, monkeypatch: pytest
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mild_viz.checkpoint.save_file", full)
+    monkeypatch.setattr("mild_viz.checkpoint.folder.save_file", full)
     with pytest.raises(UserError, match=r"model cannot be written: No space"):
         save_checkpoint(random_checkpoint(1), folder, "")
     assert load_checkpoint(folder).name == "random"
@@ -155,9 +155,50 @@ def test_values_that_are_not_finite_are_named(folder: Path) -> None:
         ({"schema_version": 99}, "schema_version is 99"),
         ({"window": 8}, "window is 8 observations, this program works with 5"),
         ({"actions": ["hug"]}, "action 'hug' is unknown; valid: wave"),
-        ({"variants": {"v9": {}}}, "variant 'v9' is unknown; valid: v1"),
-        ({"hidden": "wide"}, "malformed"),
-        ({"robot": {"name": "pepper"}}, "malformed"),
+        ({"variants": {"v9": {}}}, "variants 'v9' is unknown; valid: v1"),
+        ({"schema_version": [1]}, r"schema_version is \[1\]"),
+        ({"window": "5"}, "window is '5' observations, this program works with 5"),
+        ({"hidden": "wide"}, r"hidden is 'wide', expected a list"),
+        ({"hidden": [40]}, r"hidden is \[40\], expected the widths of two layers"),
+        ({"hidden": [40, float("inf")]}, "hidden is inf, expected a whole number from 1"),
+        ({"hidden": [40, 20.5]}, r"hidden is 20\.5, expected a whole number"),
+        ({"n_states": float("inf")}, "n_states is inf, expected a whole number"),
+        ({"n_states": "6"}, "n_states is '6', expected a whole number"),
+        ({"n_states": 0}, "n_states is 0, expected a whole number"),
+        ({"latent_size": 10**4000}, "latent_size is 1000.*, expected a whole number"),
+        ({"latent_size": True}, "latent_size is True, expected a whole number"),
+        ({"name": 5}, "name is 5, expected a text"),
+        ({"dataset": "demo"}, "dataset is 'demo', expected an object"),
+        ({"dataset": {}}, "dataset: missing name"),
+        ({"actions": []}, r"actions is \[\], expected one name or more"),
+        ({"actions": "wave"}, "actions is 'wave', expected a list"),
+        ({"actions": [["wave"]]}, r"actions: an entry is \['wave'\], expected a text"),
+        ({"actions": ["wave", "wave"]}, "expected one name or more, each once"),
+        ({"robot": {"name": "pepper"}}, "robot: missing joint_names, end_effector"),
+        ({"robot": {"name": "pepper", "joint_names": "abcd", "end_effector": "x"}}, "joint_names is 'abcd', expected"),
+        ({"variants": ["v1"]}, r"variants is \['v1'\], expected an object"),
+        ({"variants": {}}, "variants is empty; a model that drives pepper has one or more of: v1"),
+        ({"variants": {"v1": {}}}, r"variants\.v1 was trained as \{\}, here it means \{'name': 'v1'"),
+        ({"variants": {"v1": []}}, r"variants\.v1 is \[\], expected an object"),
+        ({"variants": {"v1": {**asdict(VARIANTS["v1"]), "more": 1}}}, r"variants\.v1 was trained as .*'more'"),
+        ({"contact_states": None}, "contact_states is None, expected an object"),
+        ({"contact_states": [1]}, r"contact_states is \[1\], expected an object"),
+        ({"contact_states": {"wave": [99]}}, r"wave: states \[99\] do not exist; valid: 0 to 5"),
+        ({"contact_states": {"dance": [1]}}, "action 'dance' is unknown; valid: wave"),
+        ({"placement": {"distance": "far", "lateral": 0, "height": 0}}, r"distance is 'far', expected a finite number"),
+        ({"placement": {"distance": float("nan"), "lateral": 0, "height": 0}}, "distance is nan, expected a finite"),
+        ({"placement": {"distance": 10**4000, "lateral": 0, "height": 0}}, "distance is 10.*, expected a finite"),
+        (
+            {"placement": {"distance": 200, "lateral": 0, "height": 0}},
+            r"placement: distance is 200\.0; valid: a number",
+        ),
+        ({"placement": {"distance": 1}}, "placement: missing lateral, height"),
+        (
+            {"placement": {"distance": 1, "lateral": 0, "height": 0, "yaw": 0}},
+            "placement: yaw unknown; valid: distance",
+        ),
+        ({"placement": 5}, "placement is 5, expected an object"),
+        ({"training": None}, "training is None, expected an object"),
         ({"robot": {"name": "yumi", "joint_names": list("abcdefg"), "end_effector": "x"}}, "shape"),
     ],
 )
@@ -165,6 +206,43 @@ def test_a_wrong_config_is_named(folder: Path, changes: dict[str, Any], message:
     edit_config(folder, **changes)
     with pytest.raises(UserError, match=message):
         load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"n_states": ' + "9" * 5000 + "}", "[1]", "null", "\xff"])
+@pytest.mark.parametrize("name", ["config.json", "contact_states.json"])
+def test_strange_json_is_named(folder: Path, name: str, text: str) -> None:
+    (folder / name).write_text(text, encoding="latin-1")
+    with pytest.raises(UserError, match=rf"{name}.* (is not valid JSON|expected an object)"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"wave": "123"}', '{"wave": {"1": 2}}', '{"wave": [1.7]}', '{"wave": [true]}', '{"wave": [1e400]}'],
+)
+def test_contact_states_are_lists_of_whole_numbers(folder: Path, text: str) -> None:
+    edit_config(folder, contact_states=json.loads(text))
+    with pytest.raises(UserError, match=r"config\.json: contact_states: wave is .*, expected"):
+        load_checkpoint(folder)
+    edit_config(folder, contact_states={})
+    (folder / "contact_states.json").write_text(text)
+    with pytest.raises(UserError, match=r"contact_states\.json: wave is .*, expected"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("kind", ["BF16", "F8_E4M3", "U64", "Q7"])
+def test_strange_number_types_are_named(folder: Path, kind: str) -> None:
+    header = json.dumps({"human/output.bias": {"dtype": kind, "shape": [0], "data_offsets": [0, 0]}}).encode()
+    (folder / "weights.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(UserError, match=r"weights\.safetensors"):
+        load_checkpoint(folder)
+
+
+def test_a_place_that_cannot_be_is_refused() -> None:
+    assert Placement(0.9, -99.0, 0.0).lateral == -99.0
+    for value in (float("nan"), float("inf"), 100.0, -1e9):
+        with pytest.raises(UserError, match="lateral is .*; valid: a number of metres between -100 and 100"):
+            Placement(0.9, value, 0.0)
 
 
 def test_broken_files_are_named(folder: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,3 +122,22 @@ def test_invalid_models_are_named() -> None:
     flat = HMM(hmm.initial_probs, hmm.transition_matrix, hmm.emission_means, 0 * hmm.emission_covariances)
     with pytest.raises(UserError, match="not positive definite"):
         check_hmm(flat, "file")
+
+
+@pytest.mark.parametrize("name", HMM.__dataclass_fields__)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_named(name: str, value: float) -> None:
+    hmm = random_hmm(np.random.default_rng(4), 3, 2)
+    tensor = getattr(hmm, name).copy()
+    tensor.flat[0] = value
+    with pytest.raises(UserError, match=f"file: {name} has values that are not finite"):
+        check_hmm(replace(hmm, **{name: tensor}), "file")
+
+
+def test_an_asymmetric_covariance_is_named() -> None:
+    hmm = random_hmm(np.random.default_rng(4), 3, 2)
+    skew = hmm.emission_covariances.copy()
+    assert check_hmm(hmm, "file") is hmm
+    skew[1, 0, 1] += 1e-3
+    with pytest.raises(UserError, match="file: emission_covariances are not symmetric"):
+        check_hmm(replace(hmm, emission_covariances=skew), "file")

@@ -67,15 +67,23 @@ def check_hmm(hmm: HMM, where: str) -> HMM:
     for name in HMM.__dataclass_fields__:
         if not np.isfinite(getattr(hmm, name)).all():
             raise UserError(f"{where}: {name} has values that are not finite")
-    if not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6) or (hmm.transition_matrix < 0).any():
+    if (hmm.transition_matrix < 0).any() or not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6):
         raise UserError(
             f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})"
         )
-    if not np.isclose(hmm.initial_probs.sum(), 1.0, atol=1e-6) or (hmm.initial_probs < 0).any():
+    if (hmm.initial_probs < 0).any() or not np.isclose(hmm.initial_probs.sum(), 1.0, atol=1e-6):
         raise UserError(f"{where}: initial_probs are not probabilities (sum {hmm.initial_probs.sum()})")
-    lowest = np.linalg.eigvalsh(hmm.emission_covariances).min()
-    if not lowest > 0:
-        raise UserError(f"{where}: an emission covariance is not positive definite (lowest eigenvalue {lowest})")
+    covariances = hmm.emission_covariances
+    largest = np.abs(covariances).max((1, 2), keepdims=True)
+    if (np.abs(covariances / largest.clip(1e-300) - covariances.swapaxes(1, 2) / largest.clip(1e-300)) > 1e-6).any():
+        raise UserError(f"{where}: emission_covariances are not symmetric")
+    try:
+        lowest = np.linalg.eigvalsh(covariances).min()
+        np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError as error:
+        lowest = f"unknown, {error}"
+    if isinstance(lowest, str) or not lowest > 0:
+        raise UserError(f"{where}: emission_covariances are not positive definite (lowest eigenvalue {lowest})")
     return hmm
 
 

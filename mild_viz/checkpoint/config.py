@@ -1,0 +1,207 @@
+"""config.json of a checkpoint: what is written, and a strict reading of what a person may have edited."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mild_viz.checkpoint.model import Checkpoint, RobotInterface
+from mild_viz.errors import UserError
+from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
+from mild_viz.trial import ACTIONS
+
+SCHEMA_VERSION = 1
+MAX_SIZE = 100_000
+"""Largest width of a layer, latent space or set of states that is read."""
+
+Kind = TypeVar("Kind")
+KINDS: dict[type, str] = {str: "a text", bool: "true or false", list: "a list [...]", dict: "an object {...}"}
+
+
+@dataclass(frozen=True)
+class Config:
+    """The content of config.json, each field checked."""
+
+    name: str
+    dataset: str
+    dataset_checksum: str
+    hidden: tuple[int, int]
+    latent_size: int
+    n_states: int
+    actions: tuple[str, ...]
+    robot: RobotInterface | None
+    variants: tuple[str, ...]
+    contact_states: dict[str, frozenset[int]]
+    placement: Placement | None
+    training: dict[str, Any]
+    metrics: dict[str, Any]
+
+
+def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What config.json says of a checkpoint."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "name": checkpoint.name,
+        "dataset": {"name": checkpoint.dataset, "checksum": checkpoint.dataset_checksum},
+        "window": WINDOW,
+        "hidden": list(checkpoint.hidden),
+        "latent_size": checkpoint.human_vae.latent_size,
+        "n_states": checkpoint.n_states,
+        "actions": list(checkpoint.actions),
+        "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
+        "variants": {name: asdict(VARIANTS[name]) for name in checkpoint.variants},
+        "contact_states": {action: sorted(states) for action, states in checkpoint.contact_states.items()},
+        "placement": asdict(checkpoint.placement) if checkpoint.placement else None,
+        "training": dict(checkpoint.training),
+        "metrics": dict(checkpoint.metrics),
+    }
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file; an error names the file and what is wrong with it."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{file} cannot be read: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, a number of thousands of digits; deep nesting
+        raise UserError(f"{file} is not valid JSON: {error}") from None
+
+
+def _typed(value: Any, kind: type[Kind], where: str) -> Kind:
+    """`value` if JSON gave it as exactly this type: nothing is converted."""
+    if type(value) is not kind:
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected {KINDS[kind]}")
+    return value
+
+
+def _size(value: Any, where: str) -> int:
+    if type(value) is not int or not 1 <= value <= MAX_SIZE:
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected a whole number from 1 to {MAX_SIZE}")
+    return value
+
+
+def _number(value: Any, where: str) -> float:
+    if type(value) not in (int, float) or not abs(value) < 1e300:  # float() has no larger integers
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected a finite number")
+    return float(value)
+
+
+def _names(value: Any, where: str) -> tuple[str, ...]:
+    names = tuple(_typed(name, str, f"{where}: an entry") for name in _typed(value, list, where))
+    if not names or len(set(names)) < len(names):
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected one name or more, each once")
+    return names
+
+
+def _need(table: Mapping[str, Any], keys: Sequence[str], where: str) -> None:
+    missing = [key for key in keys if key not in table]
+    if missing:
+        raise UserError(f"{where}: missing {', '.join(missing)}")
+
+
+def check_states(states: frozenset[int], action: str, actions: Sequence[str], n_states: int, where: str) -> None:
+    """Raise an error unless the model has this action and these states."""
+    choose(f"{where}: action", action, list(actions))
+    bad = sorted(state for state in states if not 0 <= state < n_states)
+    if bad:
+        raise UserError(f"{where}: {action}: states {reprlib.repr(bad)} do not exist; valid: 0 to {n_states - 1}")
+
+
+def parse_contact_states(value: Any, actions: Sequence[str], n_states: int, where: str) -> dict[str, frozenset[int]]:
+    """A table of action: [states], as config.json and contact_states.json hold it."""
+    result = {}
+    for action, states in _typed(value, dict, where).items():
+        if any(type(state) is not int for state in _typed(states, list, f"{where}: {action}")):
+            raise UserError(f"{where}: {action} is {reprlib.repr(states)}, expected whole numbers 0 to {n_states - 1}")
+        result[action] = frozenset(states)
+        check_states(result[action], action, actions, n_states, where)
+    return result
+
+
+def _robot(value: Any, where: str) -> RobotInterface | None:
+    if value is None:
+        return None
+    _need(_typed(value, dict, where), ("name", "joint_names", "end_effector"), where)
+    joints = _names(value["joint_names"], f"{where}.joint_names")
+    name, end = (_typed(value[key], str, f"{where}.{key}") for key in ("name", "end_effector"))
+    return RobotInterface(name, joints, end)
+
+
+def _variants(value: Any, robot: RobotInterface | None, where: str) -> tuple[str, ...]:
+    for name, row in _typed(value, dict, where).items():
+        expected = asdict(VARIANTS[choose(where, name, list(VARIANTS))])
+        meant, found = ({**table, "summary": ""} for table in (expected, _typed(row, dict, f"{where}.{name}")))
+        if found != meant:
+            raise UserError(f"{where}.{name} was trained as {reprlib.repr(row)}, here it means {expected}")
+    if robot is not None and not value:
+        raise UserError(f"{where} is empty; a model that drives {robot.name} has one or more of: {', '.join(VARIANTS)}")
+    return tuple(value)
+
+
+def _placement(value: Any, where: str) -> Placement | None:
+    if value is None:
+        return None
+    numbers = ("distance", "lateral", "height")
+    _need(_typed(value, dict, where), numbers, where)
+    unknown = sorted(value.keys() - Placement.__dataclass_fields__.keys())
+    if unknown:
+        raise UserError(f"{where}: {', '.join(unknown)} unknown; valid: {', '.join(Placement.__dataclass_fields__)}")
+    distance, lateral, height = (_number(value[key], f"{where}.{key}") for key in numbers)
+    source = _typed(value.get("source", "chosen"), str, f"{where}.source")
+    estimated = _typed(value.get("estimated", False), bool, f"{where}.estimated")
+    try:
+        return Placement(distance, lateral, height, source, estimated)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+def is_config(config: Any) -> bool:
+    """Whether this is the content of a config.json that this program wrote."""
+    return isinstance(config, dict) and config.get("schema_version") == SCHEMA_VERSION
+
+
+def read_config(file: Path) -> Config:
+    """Read and check config.json.
+
+    Raises:
+        UserError: naming the field, what was found and what was expected.
+    """
+    config = _typed(read_json(file), dict, str(file))
+    if not is_config(config):
+        found = reprlib.repr(config.get("schema_version"))
+        raise UserError(f"{file}: schema_version is {found}, this program reads {SCHEMA_VERSION}")
+    needed = ("name", "dataset", "window", "hidden", "latent_size", "n_states", "actions", "robot", "variants")
+    _need(config, needed, str(file))
+    if config["window"] != WINDOW:
+        found = reprlib.repr(config["window"])
+        raise UserError(f"{file}: window is {found} observations, this program works with {WINDOW}")
+    hidden = _typed(config["hidden"], list, f"{file}: hidden")
+    if len(hidden) != 2:
+        raise UserError(f"{file}: hidden is {reprlib.repr(hidden)}, expected the widths of two layers")
+    dataset = _typed(config["dataset"], dict, f"{file}: dataset")
+    _need(dataset, ("name",), f"{file}: dataset")
+    n_states = _size(config["n_states"], f"{file}: n_states")
+    actions = _names(config["actions"], f"{file}: actions")
+    for action in actions:
+        choose(f"{file}: action", action, ACTIONS)
+    robot = _robot(config["robot"], f"{file}: robot")
+    contact = parse_contact_states(config.get("contact_states", {}), actions, n_states, f"{file}: contact_states")
+    return Config(
+        name=_typed(config["name"], str, f"{file}: name"),
+        dataset=_typed(dataset["name"], str, f"{file}: dataset.name"),
+        dataset_checksum=_typed(dataset.get("checksum", ""), str, f"{file}: dataset.checksum"),
+        hidden=(_size(hidden[0], f"{file}: hidden"), _size(hidden[1], f"{file}: hidden")),
+        latent_size=_size(config["latent_size"], f"{file}: latent_size"),
+        n_states=n_states,
+        actions=actions,
+        robot=robot,
+        variants=_variants(config["variants"], robot, f"{file}: variants"),
+        contact_states=contact,
+        placement=_placement(config.get("placement"), f"{file}: placement"),
+        training=_typed(config.get("training", {}), dict, f"{file}: training"),
+        metrics=_typed(config.get("metrics", {}), dict, f"{file}: metrics"),
+    )
