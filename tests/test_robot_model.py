@@ -324,8 +324,35 @@ def test_unknown_robot_and_missing_file(tmp_path):
 def test_missing_joint_lists_those_it_has(small_arm):
     with pytest.raises(UserError, match="has no joint 'RShoulderPitch'; it has: swing$"):
         load_robot(str(small_arm), end_effector="hand")
+    with pytest.raises(UserError, match="has no joint 'RShoulderPitch'; it has: swing$"):
+        load_robot(str(small_arm))  # no r_gripper either, but the joints are what was asked for
     with pytest.raises(UserError, match="has no link 'r_gripper'; it has: base, upper, hand, finger$"):
         load_robot(str(small_arm), ("swing",))
+
+
+def test_what_the_arm_does_not_need_does_not_stop_it(small_arm):
+    # pytorch-kinematics stumbles over each of these; the finger is beyond the end effector
+    odd = ARM.replace('<axis xyz="0 0 2"/>', "").replace('scale="2 2 2"', 'scale="2"').replace(' velocity="1"', "")
+    odd = odd.replace('name="follow" type="revolute"', 'name="follow" type="floating"')
+    small_arm.write_text(odd.replace('<mimic joint="swing" multiplier="-2" offset="0.25"/>', "<!-- no mimic -->"))
+    robot = load_robot(str(small_arm), ("swing",), "hand")
+    np.testing.assert_array_equal(robot.chain.axes, [[1.0, 0.0, 0.0]])  # a URDF's default
+    joints = np.array([[0.7]])
+    hand = [0.4 * np.cos(0.5), 0.4 * np.sin(0.5), 1.0]
+    np.testing.assert_allclose(robot.end_effector(joints)[0], hand, atol=1e-6)
+    np.testing.assert_allclose(
+        robot.link_poses(joints)[0, robot.link_names.index("finger"), 4:],
+        np.multiply(hand, (1.25, 1.25, 1)),
+        atol=1e-12,
+    )
+    assert set(robot.visuals) == {"base", "upper", "finger"}
+
+
+def test_other_robots_are_told_which_joints_they_lack(shared):
+    for relative, joint in (("robots/panda", "panda_joint1"), ("robots/yumi", "yumi_joint_1_r")):
+        urdf = next(shared(relative).rglob("*.urdf"))
+        with pytest.raises(UserError, match=f"has no joint 'RShoulderPitch'; it has: .*{joint}"):
+            load_robot(str(urdf))
 
 
 def test_joints_that_cannot_be_controlled(small_arm):
@@ -346,8 +373,56 @@ def test_joints_that_cannot_be_controlled(small_arm):
         ("<robot name='x'/>", "form no single tree"),
         (ARM.replace('child link="upper"', 'child link="base"'), "the joints form a loop"),
         (ARM.replace('child link="upper"', 'child link="gone"'), "form no single tree"),
-        (ARM.replace('xyz="0 0 1" rpy', 'xyz="0 zero 1" rpy'), "not a valid URDF"),
+        (
+            ARM.replace('xyz="0 0 1" rpy', 'xyz="0 zero 1" rpy'),
+            "joint swing: xyz of <origin> is '0 zero 1'; expected 3 finite numbers",
+        ),
+        (ARM.replace('xyz="0 0 1" rpy', 'xyz="0 nan 1" rpy'), "joint swing: xyz of <origin> is '0 nan 1'"),
+        (ARM.replace('xyz="0 0 1" rpy', 'xyz="0 inf 1" rpy'), "joint swing: xyz of <origin> is '0 inf 1'"),
+        (ARM.replace('xyz="0 0 1" rpy', 'xyz="0 1" rpy'), "joint swing: xyz of <origin> is '0 1'; expected 3"),
+        (ARM.replace('rpy="0 0 0.5"', 'rpy="0 0 0.5 1"'), "joint swing: rpy of <origin> is '0 0 0.5 1'; expected 3"),
         (ARM.replace('axis xyz="0 0 2"', 'axis xyz="0 0 0"'), r"joint swing has the axis \[0.0, 0.0, 0.0\]"),
+        (ARM.replace('axis xyz="0 0 2"', 'axis xyz="0 2"'), "joint swing: xyz of <axis> is '0 2'; expected 3"),
+        (
+            ARM.replace('multiplier="-2"', 'multiplier="nan"'),
+            "joint follow: multiplier of <mimic> is 'nan'; expected 1 finite number$",
+        ),
+        (ARM.replace('mimic joint="swing"', 'mimic joint="gone"'), "follow mimics 'gone'; valid.*: swing, slide$"),
+        (ARM.replace('mimic joint="swing"', 'mimic joint="follow"'), "follow mimics 'follow'; valid"),
+        (ARM.replace("<mimic joint", "<mimic leader"), "follow mimics ''; valid"),
+        (
+            ARM.replace('scale="2 2 2"', 'scale="2 2"'),
+            "link upper: scale of <mesh> is '2 2'; expected 1 or 3 finite numbers other than 0",
+        ),
+        (ARM.replace('scale="2 2 2"', 'scale="2 0 2"'), "link upper: scale of <mesh> is '2 0 2'"),
+        (ARM.replace('filename="package://parts/tri.stl"', ""), "link upper: <mesh> has no filename"),
+        (ARM.replace('rgba="1 0.5 0 1"', 'rgba="1 0.5 0"'), "material paint: rgba of <color> is '1 0.5 0'; expected 4"),
+        (ARM.replace('sphere radius="0.01"', "sphere"), "link finger: radius of <sphere> is missing; expected 1"),
+        (ARM.replace('box size="0.2 0.2 0.2"', 'box size="0.2 0.2"'), "link base: size of <box> is '0.2 0.2'"),
+        (ARM.replace('<box size="0.2 0.2 0.2"/>', ""), "not a valid URDF"),
+        (ARM.replace('<link name="hand"/>', '<link name="&hand;"/>'), "not a valid URDF.*Entity 'hand' not defined"),
+        ('<!DOCTYPE robot SYSTEM "robot.dtd">' + ARM.replace('name="two"', 'name="&two;"'), "declares XML entities"),
+        ('<!DOCTYPE robot [<!ENTITY two "two">]>' + ARM, "declares XML entities"),
+        (
+            ARM.replace('name="swing" type="revolute"', 'name="swing" type="hinge"'),
+            "joint swing has the type 'hinge'; va",
+        ),
+        (ARM.replace('joint name="slide"', 'joint name="swing"'), "2 <joint> have the name 'swing'; expected unique"),
+        (ARM.replace('<link name="finger">', "<link>"), "1 <link> have the name None; expected unique names"),
+        (ARM.replace('<parent link="upper"/>', ""), "joint slide has no <parent> with a link"),
+        (
+            ARM.replace('type="prismatic"', 'type="floating"'),
+            "joint 'slide', between .* and 'hand', is floating; valid",
+        ),
+        (ARM.replace('type="prismatic"', 'type="planar"'), "joint 'slide', between .* and 'hand', is planar; valid th"),
+        (
+            ARM.replace('lower="-1" upper="2"', 'upper="2"'),
+            "'swing' is revolute and has the limits -inf to 2.0; expected",
+        ),
+        (
+            ARM.replace('<limit lower="-1" upper="2" effort="1" velocity="1"/>', ""),
+            "joint 'swing' is revolute and has the limits -inf to inf; expected a <limit> with a finite lower",
+        ),
         (ARM.replace('lower="-1" upper="2"', 'lower="3" upper="2"'), "joint swing has the limits 3.0 to 2.0"),
         (ARM.replace('lower="-1" upper="2"', 'lower="nan" upper="2"'), "joint swing has the limits nan to 2.0"),
     ],

@@ -17,11 +17,15 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.errors import UserError
-from mild_viz.robot.description import TURNING, Description
+from mild_viz.robot.description import TURNING, Description, Joint
 from mild_viz.trial import freeze_arrays
 
-FOLD_VERSION = 1
+FOLD_VERSION = 2
 """Raise it whenever the fold changes, so that older caches are not used."""
+
+
+JOINTED = (*TURNING, "prismatic", "fixed")
+"""Joint types that may lie between the base and the end effector."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +88,28 @@ def load_chain(
 ) -> ArmChain:
     """The chain of `joint_names` up to `end_effector`; joints in between that are not named rest.
 
-    Raises `UserError` where a joint or the end effector is missing, where a joint does not turn, or where
-    it is not between the base and the end effector in the given order.
+    Raises `UserError` where a joint or the end effector is missing, where a joint does not turn or states no
+    limits, where it is not between the base and the end effector in the given order, or where a joint of several
+    degrees of freedom is.
     """
-    description.require_link(end_effector)
     joints = [description.joint(name) for name in joint_names]
+    description.require_link(end_effector)
     for joint in joints:
         if joint.kind not in TURNING or joint.mimic is not None:
             kind = "mimic" if joint.mimic is not None else joint.kind
             raise UserError(f"{description.path}: joint '{joint.name}' is {kind}; a controlled joint must turn freely")
+        if joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).all():
+            raise UserError(
+                f"{description.path}: joint '{joint.name}' is revolute and has the limits {joint.lower} to "
+                f"{joint.upper}; expected a <limit> with a finite lower and upper [rad], or the type continuous"
+            )
     between = [joint.name for joint in description.path_to(end_effector)]
+    for joint in description.path_to(end_effector):
+        if joint.kind in ("floating", "planar"):
+            raise UserError(
+                f"{description.path}: joint '{joint.name}', between the base and '{end_effector}', is {joint.kind}; "
+                f"valid there: {', '.join(JOINTED)}"
+            )
     if [name for name in between if name in joint_names] != list(joint_names):
         raise UserError(
             f"{description.path}: joints {', '.join(joint_names)} are not in this order between the base and "
@@ -141,10 +157,9 @@ def _fold(
     """Multiply the fixed transforms between controlled joints, as pytorch-kinematics parses them."""
     import pytorch_kinematics as pk  # slow: it imports torch
 
-    content = description.path.read_bytes()
-    with contextlib.redirect_stderr(io.StringIO()):  # its parser prints a line for every tag it does not know
-        frames = pk.build_serial_chain_from_urdf(content, end_effector, description.root)._serial_frames
-    fixed = {joint.name: joint for joint in description.joints}
+    between = description.path_to(end_effector)
+    frames = pk.build_serial_chain_from_urdf(_bare(description, between), end_effector, description.root)._serial_frames
+    fixed = {joint.name: joint for joint in between}
     offsets, axes = [np.eye(4)], []
     for frame in frames:
         if frame.joint.offset is not None:
@@ -157,6 +172,26 @@ def _fold(
             joint = fixed[frame.joint.name]
             offsets[-1] = offsets[-1] @ np.linalg.inv(joint.origin) @ joint.motion(values[joint.name])
     return np.array(offsets), np.array(axes)
+
+
+def _bare(description: Description, joints: tuple[Joint, ...]) -> bytes:
+    """The file without all but the places and axes of `joints`: the rest is not needed, and its parser is strict."""
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    robot = etree.fromstring(description.path.read_bytes())
+    kept = {("link", description.root), *(("link", joint.child) for joint in joints)}
+    kept |= {("joint", joint.name) for joint in joints}
+    for part in list(robot):
+        if (part.tag, part.get("name")) not in kept:
+            robot.remove(part)
+            continue
+        for detail in list(part):
+            if detail.tag not in ("parent", "child", "origin", "axis"):
+                part.remove(detail)
+        if part.tag == "joint":
+            axis = part.find("axis") if part.find("axis") is not None else etree.SubElement(part, "axis")
+            axis.set("xyz", axis.get("xyz", "1 0 0"))  # the default of a URDF; pytorch-kinematics takes z
+    return etree.tostring(robot)
 
 
 def _unit(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,28 @@ if TYPE_CHECKING:
 
 TURNING = ("revolute", "continuous")
 """Joint types that can be controlled."""
+
+KINDS = (*TURNING, "prismatic", "fixed", "floating", "planar")
+"""Joint types of a URDF; those of the last two rest at their origin."""
+
+FIELDS = (
+    # where, attribute, how many numbers, whether it must be there
+    ("joint/origin", "xyz", (3,), False),
+    ("joint/origin", "rpy", (3,), False),
+    ("joint/axis", "xyz", (3,), False),
+    ("joint/mimic", "multiplier", (1,), False),
+    ("joint/mimic", "offset", (1,), False),
+    ("link/visual/origin", "xyz", (3,), False),
+    ("link/visual/origin", "rpy", (3,), False),
+    ("link/visual/geometry/box", "size", (3,), True),
+    ("link/visual/geometry/sphere", "radius", (1,), True),
+    ("link/visual/geometry/cylinder", "radius", (1,), True),
+    ("link/visual/geometry/cylinder", "length", (1,), True),
+    ("link/visual/geometry/mesh", "scale", (1, 3), False),
+    ("link/visual/material/color", "rgba", (4,), False),
+    ("material/color", "rgba", (4,), False),
+)
+"""The numbers that are used. yourdfpy takes NaN, and too many or too few of them, without a word."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +53,7 @@ class Joint:
     origin: Float[np.ndarray, "4 4"]
     axis: Float[np.ndarray, "3"]
     lower: float
+    """Infinite where the file states no limit [rad or m]."""
     upper: float
     mimic: tuple[str, float, float] | None
     """(joint, multiplier, offset) where this joint follows another one."""
@@ -105,14 +128,82 @@ def read_description(path: Path) -> Description:
     try:
         # parsed here first, because yourdfpy would go on with whatever it can recover
         element = etree.fromstring(content, etree.XMLParser(resolve_entities=False, no_network=True))
-        if element.tag != "robot":
-            raise UserError(f"{path}: the root element is <{element.tag}>; expected a URDF description, <robot>")
+    except etree.XMLSyntaxError as error:
+        raise UserError(f"{path} is not a valid URDF description: {error}") from error
+    _check_fields(path, element)
+    try:
         urdf = yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False)
         joints = [_convert(joint) for joint in urdf.robot.joints]
-    except (etree.XMLSyntaxError, AttributeError, KeyError, ValueError, TypeError) as error:
+    except Exception as error:  # whatever yourdfpy stumbles over
         raise UserError(f"{path} is not a valid URDF description: {error}") from error
     links = [link.name for link in urdf.robot.links]
+    _check_mimics(path, joints)
     return Description(path, hashlib.sha256(content).hexdigest(), *_sort(path, links, joints), urdf)
+
+
+def _check_fields(path: Path, element: Any) -> None:
+    """`UserError` naming the first name, type or number of a parsed file that cannot be used."""
+    if element.tag != "robot":
+        raise UserError(f"{path}: the root element is <{element.tag}>; expected a URDF description, <robot>")
+    types = element.getroottree().docinfo.internalDTD
+    if types is not None and (types.system_url or types.entities()):
+        raise UserError(f"{path} declares XML entities; expected a URDF description without them")
+    for kind in ("link", "joint"):
+        names = [part.get("name") for part in element.iterfind(kind)]
+        for name in names:
+            if not name or names.count(name) > 1:
+                raise UserError(f"{path}: {names.count(name)} <{kind}> have the name {name!r}; expected unique names")
+    for joint in element.iterfind("joint"):
+        for end in ("parent", "child"):
+            if joint.find(end) is None or not joint.find(end).get("link"):
+                raise UserError(f"{path}: joint {joint.get('name')} has no <{end}> with a link; expected one")
+        if joint.get("type") not in KINDS:
+            raise UserError(
+                f"{path}: joint {joint.get('name')} has the type {joint.get('type')!r}; valid: {', '.join(KINDS)}"
+            )
+    for where, attribute, counts, required in FIELDS:
+        for part in element.iterfind(where):
+            if required or part.get(attribute) is not None:
+                _check_numbers(path, part, attribute, counts)
+    for mesh in element.iterfind("link/visual/geometry/mesh"):
+        if not mesh.get("filename"):
+            raise UserError(f"{path}: {_owner(mesh)}: <mesh> has no filename; expected the file of the mesh")
+
+
+def _check_numbers(path: Path, part: Any, attribute: str, counts: tuple[int, ...]) -> None:
+    text = part.get(attribute)
+    words = (text or "").replace(",", " ").split() if attribute == "scale" else (text or "").split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        numbers = np.array([np.nan])
+    good = len(numbers) in counts and np.isfinite(numbers).all()
+    if not good or (attribute == "scale" and not numbers.all()):
+        expected = " or ".join(str(count) for count in counts) + (
+            " finite number" if counts == (1,) else " finite numbers"
+        )
+        expected += " other than 0" if attribute == "scale" else ""
+        got = "missing" if text is None else f"'{text}'"
+        raise UserError(f"{path}: {_owner(part)}: {attribute} of <{part.tag}> is {got}; expected {expected}")
+
+
+def _owner(part: Any) -> str:
+    """The link, joint or material that an element belongs to."""
+    while part.getparent().tag != "robot":
+        part = part.getparent()
+    return f"{part.tag} {part.get('name')}"
+
+
+def _check_mimics(path: Path, joints: list[Joint]) -> None:
+    """`UserError` where a joint follows none, or one that itself follows another."""
+    leaders = [joint.name for joint in joints if joint.mimic is None]
+    for joint in joints:
+        if joint.mimic is not None and joint.mimic[0] not in leaders:
+            valid = [other.name for other in joints if other.mimic is None and other.kind != "fixed"]
+            raise UserError(
+                f"{path}: joint {joint.name} mimics '{joint.mimic[0]}'; valid, a joint that mimics no other: "
+                f"{', '.join(valid) or 'none'}"
+            )
 
 
 def _convert(joint: yourdfpy.Joint) -> Joint:
@@ -125,14 +216,14 @@ def _convert(joint: yourdfpy.Joint) -> Joint:
         axis = axis / length
     lower, upper = -np.inf, np.inf
     if joint.limit is not None and joint.type in ("revolute", "prismatic"):
-        lower = 0.0 if joint.limit.lower is None else float(joint.limit.lower)
-        upper = 0.0 if joint.limit.upper is None else float(joint.limit.upper)
+        lower = lower if joint.limit.lower is None else float(joint.limit.lower)
+        upper = upper if joint.limit.upper is None else float(joint.limit.upper)
         if not lower <= upper:
             raise ValueError(f"joint {joint.name} has the limits {lower} to {upper}")
     mimic = None
     if joint.mimic is not None:
         multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
-        mimic = (joint.mimic.joint, multiplier, float(joint.mimic.offset or 0.0))
+        mimic = (joint.mimic.joint or "", multiplier, float(joint.mimic.offset or 0.0))
     return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, mimic)
 
 
