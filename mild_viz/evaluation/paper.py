@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_ACTIONS = ("wave", "handshake", "rocket", "parachute")
+from mild_viz.data.checks import LABELS
 
 _ROBOT = {
     "nuisi": {
@@ -37,5 +37,5 @@ def paper_rows(dataset: str, human_human: bool) -> list[tuple[str, str, float, f
     return [
         (f"paper {model}", action, mean, std)
         for model, figures in table.items()
-        for action, (mean, std) in zip(_ACTIONS, figures, strict=True)
+        for action, (mean, std) in zip(LABELS, figures, strict=True)
     ]
