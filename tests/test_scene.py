@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -118,9 +120,10 @@ def test_the_ghost_shows_the_decoded_arm_only_where_it_differs(
     assert "/robot/ghost/torso" not in node_names(server), "links that stand still need no ghost"
     scene.set_frame(0)
     assert not node(server, "/robot/ghost").visible, "decoded and commanded coincide"
+    assert node(server, "/robot/caption").text == "mild-ik command · pale: decoded, before IK"
     scene.show(rollout, ViewSettings(ghost=False))
     scene.set_frame(apart)
-    assert not node(server, "/robot/ghost").visible
+    assert not node(server, "/robot/ghost").visible and node(server, "/robot/caption").text == "mild-ik command"
 
 
 def test_recorded_joints_are_drawn_where_they_were_seen_and_gaps_are_hidden(
@@ -128,7 +131,7 @@ def test_recorded_joints_are_drawn_where_they_were_seen_and_gaps_are_hidden(
 ) -> None:
     arm = arm_rollout.inference.human_arm.copy()
     arm[50:60] = np.nan
-    inference = replace(arm_rollout.inference, human_arm=arm)
+    inference = replace(arm_rollout.inference, human_arm=arm, tracked=np.isfinite(arm).all((1, 2)))
     scene.show(replace(arm_rollout, inference=inference), ViewSettings())
     scene.set_frame(20)
     joints = node(server, "/human/joints")
@@ -137,6 +140,7 @@ def test_recorded_joints_are_drawn_where_they_were_seen_and_gaps_are_hidden(
     scene.set_frame(55)
     assert not joints.batched_scales.any() and not node(server, "/human/limbs").batched_scales.any()
     assert np.isfinite(joints.batched_positions).all() and node(server, "/human/lost").visible
+    assert not node(server, "/reach/line").visible and not node(server, "/reach/distance").visible
 
 
 def test_limbs_reach_from_joint_to_joint() -> None:
@@ -156,8 +160,7 @@ def test_what_was_not_observed_is_schematic_and_says_so(
     server: viser.ViserServer, scene: Scene, rollout: Rollout, arm_rollout: Rollout
 ) -> None:
     scene.show(arm_rollout, ViewSettings())
-    assert node(server, "/human/not_observed").visible
-    assert node(server, "/human/not_observed").text == "not observed"
+    assert node(server, "/human/caption").text == "right arm observed, rest schematic"
     parts = ("torso", "head", "left_arm", "support")
     assert all(0.0 < node(server, f"/human/schematic/{part}").opacity < 0.5 for part in parts)
     shoulder = np.nanmedian(arm_rollout.inference.human_arm[:, 0], axis=0)
@@ -170,7 +173,7 @@ def test_what_was_not_observed_is_schematic_and_says_so(
     assert skeleton is not None
     assert len(node(server, "/human/joints").batched_positions) == len(skeleton.joint_names)
     assert len(node(server, "/human/limbs").batched_positions) == len(skeleton.bones)
-    assert not node(server, "/human/not_observed").visible, "the demo set tracks the legs too"
+    assert node(server, "/human/caption").text == "red arm: model input", "the demo set tracks the legs too"
     assert not {"/human/schematic/left_arm", "/human/schematic/support"} & node_names(server)
 
 
@@ -197,7 +200,10 @@ def test_the_gap_between_the_hands_is_drawn_and_written(
         )
         text = node(server, "/reach/distance").text
         assert text.startswith(f"{100.0 * rollout.hand_distance[n]:.1f} cm")
-        assert text.endswith("contact") == rollout.contact[n] == node(server, "/reach/contact").visible
+        assert text.endswith("contact state") == rollout.contact[n]
+    for distance, marked in ((0.049, True), (0.11, False)):
+        scene.show(replace(rollout, hand_distance=np.full_like(rollout.hand_distance, distance)), ViewSettings())
+        assert node(server, "/reach/contact").visible == marked, "a contact state alone is not a touch"
     far = replace(rollout, hand_distance=np.full_like(rollout.hand_distance, np.nan))
     scene.show(far, ViewSettings())
     assert not node(server, "/reach/line").visible and not node(server, "/reach/distance").visible
@@ -228,6 +234,10 @@ def test_a_robot_that_must_stand_higher_gets_a_pedestal(
     assert layout is not None
     top = node(server, "/ground/pedestal").vertices[:, 2]
     assert top.min() == pytest.approx(layout.floor, abs=1e-5) and top.max() > layout.floor + 0.1
+    scene.show(rollout, ViewSettings(show_robot=False))
+    assert "/ground/pedestal" not in node_names(server), "it goes with the robot"
+    scene.show(rollout, ViewSettings())
+    assert "/ground/pedestal" in node_names(server)
     raised = rollout.T_world_human.copy()
     raised[2, 3] += 1.2
     scene.show(replace(rollout, T_world_human=raised), ViewSettings())
@@ -368,9 +378,19 @@ def test_a_control_only_rerun_keeps_figure_and_latent_arrays(
     scene.set_frame(25)
     scene.show(replace(rollout, controller="mild"), ViewSettings())
     assert scene._figure is figure and scene._latent_frames is latent and node_names(server) == names
-    assert node(server, "/robot/caption").text == "mild command"
+    assert node(server, "/robot/caption").text.startswith("mild command")
     i = rollout.link_names.index("RForeArm")
     np.testing.assert_allclose(node(server, "/robot/solid/RForeArm").position, rollout.link_poses[25, i, 4:], atol=2e-5)
+
+
+def test_only_states_that_are_ever_active_are_named(server: viser.ViserServer, scene: Scene, rollout: Rollout) -> None:
+    active = np.where(rollout.inference.active_state == 2, 1, rollout.inference.active_state)
+    scene.show(replace(rollout, inference=replace(rollout.inference, active_state=active)), ViewSettings())
+    for agent in ("human", "robot"):
+        named = [node(server, f"/latent/{agent}/label{state}").visible for state in range(N_STATES)]
+        assert named == [True, True, False, True]
+    scene.show(rollout, ViewSettings())
+    assert node(server, "/latent/human/label2").visible
 
 
 def test_a_model_with_fewer_states_takes_the_others_away(
@@ -389,10 +409,9 @@ def test_every_preset_sees_what_it_is_for(scene: Scene, rollout: Rollout, aspect
     scene.show(rollout, ViewSettings())
     layout = scene.layout
     assert layout is not None
-    corner = 0.5 * PLOT_SIZE
-    plot = [
-        layout.plot_centre + [x, y, z] for x in (-corner, corner) for y in (-corner, corner) for z in (-corner, corner)
-    ]
+    signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), axis=-1).reshape(-1, 3)
+    turn = np.array([np.cos(0.5 * layout.plot_yaw), 0.0, 0.0, np.sin(0.5 * layout.plot_yaw)])
+    plot = list(layout.plot_centre + rotate(turn, 0.5 * PLOT_SIZE * signs))
     dyad = [layout.robot_top, layout.human_top, layout.hand, np.array([0.0, 0.0, layout.floor])]
     wanted = {"both": dyad + plot, "experimenter": dyad, "latent": plot, "participant": [layout.robot_top, layout.hand]}
     assert set(wanted) == set(CAMERAS)
@@ -405,6 +424,62 @@ def test_every_preset_sees_what_it_is_for(scene: Scene, rollout: Rollout, aspect
     assert scene.camera("both", aspect).fov == pytest.approx(FIELD_OF_VIEW)
     with pytest.raises(UserError, match="camera 'top' is unknown; valid: both, participant, experimenter, latent"):
         scene.camera("top")
+
+
+class Client(viser.ClientHandle):
+    """What the scene needs of a browser: a camera and its canvas."""
+
+    def __init__(self, client_id: int) -> None:
+        self.client_id = client_id
+        self.camera: Any = SimpleNamespace(
+            image_width=930,
+            image_height=430,
+            position=np.ones(3),
+            look_at=np.zeros(3),
+            fov=1.0,
+            up_direction=np.zeros(3),
+        )
+
+    def atomic(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+def stands_at(client: Client, view: Camera) -> bool:
+    camera = client.camera
+    return np.allclose([camera.position, camera.look_at], [view.position, view.look_at], atol=1e-6)
+
+
+def test_presets_follow_layout_and_canvas_until_a_person_turns_the_camera(
+    server: viser.ViserServer, scene: Scene, rollout: Rollout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    new, side, turned = Client(1), Client(2), Client(3)
+    clients = {client.client_id: client for client in (new, side, turned)}
+    monkeypatch.setattr(server, "get_clients", lambda: dict(clients))
+    scene.refit_cameras()
+    assert new.camera.fov == 1.0, "there is no layout yet"
+    scene.show(rollout, ViewSettings())
+    scene.move_camera(side, "experimenter")
+    scene.refit_cameras()
+    wide = 930 / 430
+    assert stands_at(new, scene.camera("both", wide)) and stands_at(side, scene.camera("experimenter", wide))
+    turned.camera.position = np.array(turned.camera.position) + [0.3, 0.0, 0.0]
+    stays = turned.camera.position
+
+    far = rollout.T_world_human.copy()
+    far[0, 3] += 0.5
+    scene.show(replace(rollout, T_world_human=far), ViewSettings())
+    assert not stands_at(new, scene.camera("both", wide))
+    scene.refit_cameras()
+    assert stands_at(new, scene.camera("both", wide)) and stands_at(side, scene.camera("experimenter", wide))
+    new.camera.image_width = 430
+    scene.refit_cameras()
+    assert stands_at(new, scene.camera("both", 1.0)), "the canvas has become narrow"
+    assert turned.camera.position is stays, "a person has turned it"
+    before = side.camera.position
+    far[0, 3] += 0.01
+    scene.show(replace(rollout, T_world_human=far), ViewSettings())
+    scene.refit_cameras()
+    assert side.camera.position is before, "too little to move for"
 
 
 def seen_from(view: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -478,4 +553,4 @@ def test_stature_is_that_of_an_adult_for_any_arm(rollout: Rollout) -> None:
     lost = replace(tiny, human_arm=np.full_like(tiny.human_arm, np.nan))
     assert 1.5 <= make_figure(tiny).height <= 1.95
     figure = make_figure(lost)
-    assert not figure.tracked.any() and np.isfinite(figure.torso_poses).all()
+    assert not figure.ball_scales.any() and np.isfinite(figure.torso_poses).all()

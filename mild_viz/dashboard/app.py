@@ -8,7 +8,6 @@ import threading
 import webbrowser
 from pathlib import Path
 
-import viser
 from rich.console import Console
 
 from mild_viz import paths, pipeline
@@ -50,13 +49,14 @@ class Dashboard:
         self.timeline = Timeline(self.server, self.player)
         stages = Pipeline(pipeline.infer, self._control)
         self.session = Session(self.controls.read, stages, self._show, self.controls.report)
-        self.server.on_client_connect(self._welcome)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
+        self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
         self.session.start()
 
     def stop(self) -> None:
         """End playback, worker and server."""
         self._playing.cancel()
+        self._fitting.cancel()
         self.session.close()
         self.server.stop()
 
@@ -86,18 +86,12 @@ class Dashboard:
             self._dark = dark
             self.server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
 
-    async def _welcome(self, client: viser.ClientHandle) -> None:
-        """Fit the camera to a new browser's canvas, which takes its final shape when the panels have docked."""
-        while self.scene.layout is None and client.client_id in self.server.get_clients():
-            await asyncio.sleep(0.1)
-        aspect = 0.0
-        for _ in range(6):
+    async def _fit_cameras(self) -> None:
+        """Keep every browser's preset fitted: canvases change when panels dock or fold, layouts with each trial."""
+        while True:
             await asyncio.sleep(0.25)
-            with contextlib.suppress(Exception):  # the browser may be gone again
-                now = client.camera.image_width / max(client.camera.image_height, 1)
-                if abs(now - aspect) > 0.01 * now:
-                    self.scene.move_camera(client, "both")
-                    aspect = now
+            with contextlib.suppress(Exception):  # a browser may leave at any moment
+                self.scene.refit_cameras()
 
     def _write_html(self, path: Path) -> None:
         from mild_viz.dashboard import recorder  # only a recording needs it

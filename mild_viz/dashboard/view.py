@@ -16,8 +16,9 @@ class ViewSettings:
     """Which forward variable sets the opacity of the ellipsoids, one of `ALPHA_MODES`."""
     latent_axes: tuple[int, int, int] | str = "pca"
     """Latent dimensions on the three axes, or 'pca': the principal components of all trajectories."""
-    sigma: float = 1.0
-    """Radius of the ellipsoids in standard deviations."""
+    sigma: float = 2.0
+    """Radius of the ellipsoids in standard deviations. In five dimensions one deviation holds 4 % of a Gaussian's
+    mass, two hold 45 %: with the smaller, the current point would mostly lie outside its state."""
     ghost: bool = True
     """Draw the decoded motion, before inverse kinematics, as a translucent arm."""
     show_human: bool = True

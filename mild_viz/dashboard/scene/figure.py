@@ -33,7 +33,6 @@ class Figure:
     ball_positions: Float[np.ndarray, "N Q 3"]
     ball_scales: Float[np.ndarray, "N Q 3"]
     ball_feeds: Bool[np.ndarray, " Q"]
-    tracked: Bool[np.ndarray, " N"]
     torso_poses: Float[np.ndarray, "N 7"]
     """wxyz, xyz of the middle of the shoulders."""
     head_positions: Float[np.ndarray, "N 3"]
@@ -142,7 +141,6 @@ def assemble(
         ball_positions=np.nan_to_num(positions),
         ball_scales=np.where(seen, ball_radii, 0.0)[..., None].repeat(3, axis=2),
         ball_feeds=np.isin(np.arange(n_joints), arm_joints),
-        tracked=np.asarray(seen[:, arm_joints].all(axis=1)),
         torso_poses=poses,
         head_positions=heads,
         height=height,

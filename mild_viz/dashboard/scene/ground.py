@@ -20,13 +20,16 @@ class GroundView:
         server.scene.set_up_direction("+z")
         light(server)
         self._pedestal: viser.MeshHandle | None = None
-        self._shown: tuple[float, float, Palette] | None = None
+        self._shown: tuple[float, float, Palette, bool] | None = None
 
-    def show(self, floor: float, robot_bottom: float, colors: Palette) -> None:
-        """Floor and pedestal at these heights [m]."""
-        if (floor, robot_bottom, colors) == self._shown:
+    def show(self, floor: float, robot_bottom: float, colors: Palette, robot_visible: bool) -> None:
+        """Floor and pedestal at these heights [m]; the pedestal goes with the robot."""
+        shown = (floor, robot_bottom, colors, robot_visible)
+        if shown == self._shown:
             return
-        self._shown = (floor, robot_bottom, colors)
+        if self._shown is None or self._shown[2] != colors:
+            self._server.scene.set_background_image(np.full((2, 2, 3), colors.background, dtype=np.uint8), format="png")
+        self._shown = shown
         self._server.scene.add_grid(
             "/ground/floor", 14.0, 14.0, plane="xy", cell_size=0.25, section_size=1.0, cell_color=colors.grid,
             section_color=colors.grid_section, cell_thickness=0.6, section_thickness=1.0, fade_distance=11.0,
@@ -35,7 +38,7 @@ class GroundView:
         if self._pedestal is not None:
             self._pedestal.remove()
             self._pedestal = None
-        if robot_bottom - floor > LOWEST_PEDESTAL:
+        if robot_visible and robot_bottom - floor > LOWEST_PEDESTAL:
             self._pedestal = self._server.scene.add_mesh_simple(
                 "/ground/pedestal", *pedestal(floor, robot_bottom), color=colors.pedestal, cast_shadow=False,
                 receive_shadow=False,

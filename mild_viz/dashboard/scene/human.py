@@ -23,21 +23,30 @@ class HumanView:
         self._colors = colors
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
         self._title, self._caption = add_title(server, ROOT, "Human")
-        self._unobserved = add_label(server, f"{ROOT}/not_observed", "not observed", NOTE, "center-left")
         self._lost = add_label(server, f"{ROOT}/lost", "tracking lost", NOTE, "center-center")
         self._figure: Figure | None = None
         self._schematic: dict[str, viser.MeshHandle] = {}
         self._ground: tuple[Figure, float, bytes] | None = None
 
     def show(
-        self, figure: Figure, T_world_human: Float[np.ndarray, "4 4"], floor: float, colors: Palette, visible: bool
+        self,
+        figure: Figure,
+        T_world_human: Float[np.ndarray, "4 4"],
+        floor: float,
+        colors: Palette,
+        visible: bool,
+        tracked: Bool[np.ndarray, " N"],
     ) -> None:
         """Take over a figure; observed parts become new nodes only where their number changes."""
+        self._tracked = tracked
         self._frame.visible = visible
         self._frame.position = T_world_human[:3, 3]
         self._frame.wxyz = quaternion_from_matrix(T_world_human[None, :3, :3])[0]
         last, last_colors, self._figure, self._colors = self._figure, self._colors, figure, colors
         if last is None or last.limb_feeds.tolist() != figure.limb_feeds.tolist():
+            if last is not None:  # nodes replaced under their names would be drawn with the old count for a moment
+                self._limbs.remove()
+                self._balls.remove()
             self._add_observed(figure)
         if last is None or last.height != figure.height or last.whole != figure.whole:
             self._add_part("torso", body.torso(figure.height))
@@ -65,7 +74,7 @@ class HumanView:
         torso.wxyz = head.wxyz = figure.torso_poses[n, :4]
         torso.position = figure.torso_poses[n, 4:]
         head.position = figure.head_positions[n]
-        self._lost.visible = not bool(figure.tracked[n])
+        self._lost.visible = not bool(self._tracked[n])
 
     def _add_observed(self, figure: Figure) -> None:
         scene, still = self._server.scene, np.array([1.0, 0.0, 0.0, 0.0])
@@ -104,9 +113,8 @@ class HumanView:
         crown = figure.crown
         self._title.position = self._caption.position = crown + [0.0, 0.0, 0.13]
         self._lost.position = middle + [0.0, 0.0, -0.14 * height]
-        self._unobserved.position = middle + [-0.04, 0.14 * height, (-0.45 if figure.whole else -0.24) * height]
-        self._unobserved.visible = figure.soles is None
-        self._caption.text = "red arm: model input" if figure.whole else "right arm observed"
+        whole = "red arm: model input" if figure.soles is not None else "red arm: model input, pale: schematic"
+        self._caption.text = whole if figure.whole else "right arm observed, rest schematic"
         if "left_arm" in self._schematic:
             self._schematic["left_arm"].position = middle
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import viser
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mild_viz.dashboard.scene.labels import CAPTION, TICK, add_label, add_title
 from mild_viz.dashboard.scene.layout import PLOT_SIZE, PLOT_TURN, VIEWER, Layout, picture_axes
@@ -48,6 +48,8 @@ class LatentFrames:
     ellipsoids: dict[str, tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 4"], Float[np.ndarray, "S 3"]]]
     labels: Float[np.ndarray, "A S 3"]
     """Where the states' names stand, per agent: at the ellipsoids, moved a little where they would overlap."""
+    visited: Bool[np.ndarray, " S"]
+    """Whether the state is ever active; only these are named."""
     opacity: Float[np.ndarray, "N S"]
     projection: Projection
 
@@ -67,13 +69,16 @@ def latent_frames(inference: Inference, view: ViewSettings) -> LatentFrames:
         "human": projection.ellipsoids(inference.human_state_means, inference.human_state_covariances, view.sigma),
         "robot": projection.ellipsoids(inference.robot_state_means, inference.robot_state_covariances, view.sigma),
     }
-    centres = np.concatenate([ellipsoids[agent][0] for agent in AGENTS])
+    visited = np.isin(np.arange(inference.n_states), inference.active_state)
+    labels = np.stack([ellipsoids[agent][0] for agent in AGENTS])
+    labels[:, visited] = spread(labels[:, visited].reshape(-1, 3)).reshape(len(AGENTS), -1, 3)
     return LatentFrames(
         traces={name: filled(points) for name, points in raw.items()},
         known={name: len(lines) > 0 for name, lines in solid.items()},
         lines={**solid, "prediction": dashed(solid["prediction"])},
         ellipsoids=ellipsoids,
-        labels=spread(centres).reshape(len(AGENTS), -1, 3),
+        labels=labels,
+        visited=visited,
         # Two digits: a change that nobody sees sends nothing.
         opacity=np.round(OPACITY_FLOOR + OPACITY_RANGE * alpha, 2),
         projection=projection,
@@ -109,7 +114,7 @@ class LatentView:
         self._frame.wxyz = np.array([np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)])
         if drawn[0] is frames and drawn[1] is colors:
             return
-        self._draw_box(frames.projection, colors)
+        self._draw_box(frames.projection, colors, frames.known["truth"])
         self._draw_traces(frames, colors)
         self._draw_states(frames)
 
@@ -131,7 +136,7 @@ class LatentView:
             for handle, value in zip(self._ellipsoids[agent], opacity, strict=True):
                 handle.opacity = value
 
-    def _draw_box(self, projection: Projection, colors: Palette) -> None:
+    def _draw_box(self, projection: Projection, colors: Palette, truth: bool) -> None:
         step, ticks = projection.ticks()
         lines = [grid_lines(ticks), box_edges()]
         tints = [np.tile(colors.grid_section, (len(lines[0]), 2, 1)), np.tile(colors.frame, (len(lines[1]), 2, 1))]
@@ -142,14 +147,15 @@ class LatentView:
         for handle, text, spot in zip(self._axis_labels, projection.labels, spots, strict=True):
             handle.text, handle.position = text, spot
         self._title.position = self._caption.position = (0.0, 0.0, HALF + 0.16)
-        self._caption.text = f"human red, robot blue, predicted dashed · grid {step:g}"
+        self._caption.text = f"human red, {'true robot blue, ' if truth else ''}predicted dashed · grid {step:g}"
 
     def _draw_traces(self, frames: LatentFrames, colors: Palette) -> None:
-        tints = {"human": colors.human, "truth": colors.robot, "prediction": colors.prediction}
+        tints = {"human": colors.human, "truth": colors.robot, "prediction": colors.dashes}
         self._trails = {}
         for name in TRACES:
-            faint = colors.faint(tints[name], 0.5)
-            self._line(f"path_{name}", frames.lines[name], np.array(faint, dtype=np.uint8), 1.4)
+            share, thickness = (0.9, 1.9) if name == "prediction" else (0.5, 1.4)
+            faint = colors.faint(tints[name], share)
+            self._line(f"path_{name}", frames.lines[name], np.array(faint, dtype=np.uint8), thickness)
             fade = np.linspace(0.35, 1.0, TRAIL + 1)
             shades = np.array([colors.faint(tints[name], float(share)) for share in fade], dtype=np.uint8)
             self._trails[name] = self._line(
@@ -179,7 +185,7 @@ class LatentView:
             for state, (handle, text) in enumerate(zip(handles, labels, strict=True)):
                 handle.position, handle.wxyz = centres[state], wxyzs[state]
                 handle.scale = tuple(radii[state].tolist())
-                text.position = spots[state]
+                text.position, text.visible = spots[state], bool(frames.visited[state])
 
     def _line(self, name: str, points: Segments, colors: np.ndarray, thickness: float) -> viser.LineSegmentsHandle:
         """One colour (3,), or one for each end of each piece (K, 2, 3)."""

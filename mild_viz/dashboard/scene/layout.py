@@ -10,7 +10,7 @@ from jaxtyping import Float
 from mild_viz.settings import choose
 
 CAMERAS = ("both", "participant", "experimenter", "latent")
-"""Camera presets: all three groups; over the human's shoulder; from the side of the dyad; the latent plot."""
+"""Camera presets: all groups; over the human's right shoulder; all from the robot's side; the latent plot."""
 
 PLOT_SIZE = 1.3
 """Edge of the latent plot's box [m]."""
@@ -26,6 +26,9 @@ FIELD_OF_VIEW = np.radians(28.0)
 
 WIDEST = 1.85
 """Width over height of a canvas that just shows all three groups; one that is wider needs no more distance."""
+
+TITLE_GAP, TITLE_STEP = 0.13, 0.23
+"""From a head to its title, and from the human's title up to the robot's [m]."""
 
 Vector = Float[np.ndarray, " 3"]
 
@@ -61,6 +64,17 @@ class Layout:
         return np.array([self.forward[1], -self.forward[0], 0.0])
 
     @property
+    def human_title(self) -> Vector:
+        """Above the human's head."""
+        return self.human_top + np.array([0.0, 0.0, TITLE_GAP])
+
+    @property
+    def robot_title(self) -> Vector:
+        """Above the robot's head, and high enough that its caption passes over the human's title."""
+        height = max(float(self.robot_top[2]), float(self.human_top[2]) + TITLE_STEP) + TITLE_GAP
+        return np.array([self.robot_top[0], self.robot_top[1], height])
+
+    @property
     def plot_title(self) -> Vector:
         """Above the latent plot, clear of its axis labels."""
         return self.plot_centre + np.array([0.0, 0.0, 0.5 * PLOT_SIZE + 0.16])
@@ -89,26 +103,65 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
     choose("camera", name, CAMERAS)
     floor, up = layout.floor, np.array([0.0, 0.0, 1.0])
     if name == "participant":
-        behind = layout.human_eye + 0.80 * layout.forward + 0.62 * layout.side + 0.30 * up
-        return pinhole(behind, 0.4 * layout.robot_top + 0.6 * layout.hand, np.radians(38.0))
-    plot = [
-        layout.plot_centre + PLOT_SIZE * (0.74 * a * layout.forward + 0.6 * b * layout.side + 0.5 * c * up)
-        for a in (-1, 1)
-        for b in (-1, 1)
-        for c in (-1.15, 1.0)
-    ] + [layout.plot_title + (0.12 + headroom) * up]
+        return over_shoulder(layout, aspect)
+    plot = plot_points(layout) + [layout.plot_title + (0.12 + headroom) * up]
     if name == "latent":
-        direction = layout.side + 0.12 * layout.forward + 0.28 * up
-        return fitted(np.array(plot), direction, aspect, margin=0.06)
+        direction = layout.side - 0.30 * layout.forward + 0.20 * up  # across the box, with a gap before the dyad
+        return beside(layout.human_top, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
     foot = layout.human_top * [1.0, 1.0, 0.0] + floor * up
-    above = (0.27 + headroom) * up
-    dyad = [layout.robot_top + above - 0.34 * layout.forward, layout.human_top + above + 0.26 * layout.forward]
+    dyad = [layout.robot_title + (0.14 + headroom) * up - 0.5 * layout.forward]
+    dyad += [layout.human_title + (0.14 + headroom) * up + 0.26 * layout.forward]
     dyad += [floor * up + 0.36 * (b * layout.side - layout.forward) for b in (-1, 1)]
     dyad += [foot + 0.24 * (b * layout.side + layout.forward) for b in (-1, 1)]
-    if name == "experimenter":
-        direction = layout.side - 0.55 * layout.forward + 0.38 * up
-        return fitted(np.array(dyad), direction, aspect, margin=0.03)
-    return fitted(np.array(dyad + plot), layout.side + 0.20 * up, aspect, margin=0.02)
+    oblique = -0.55 * layout.forward + 0.38 * up if name == "experimenter" else 0.20 * up
+    return fitted(np.array(dyad + plot), layout.side + oblique, aspect, margin=0.02)
+
+
+def plot_points(layout: Layout) -> list[Vector]:
+    """The corners of the latent plot's box, those below with room for the names of the axes."""
+    half = 0.5 * PLOT_SIZE
+    cos, sin = np.cos(layout.plot_yaw), np.sin(layout.plot_yaw)
+    return [
+        layout.plot_centre + reach * (a * np.array([cos, sin, 0.0]) + b * np.array([-sin, cos, 0.0])) + [0.0, 0.0, z]
+        for a in (-1.0, 1.0)
+        for b in (-1.0, 1.0)
+        for reach, z in ((half, half), (half + 0.14, -half - 0.10))
+    ]
+
+
+def over_shoulder(layout: Layout, aspect: float) -> Camera:
+    """What the person sees: just before the right eye, so that neither head nor title is in the way."""
+    up = np.array([0.0, 0.0, 1.0])
+    eye = layout.human_eye - 0.12 * layout.forward - 0.10 * layout.side + 0.05 * up
+    wanted = np.array([layout.robot_top + 0.10 * up, layout.hand - 0.12 * up])
+    ahead = unit(wanted[0] - eye) + unit(wanted[1] - eye)
+    towards = -unit(ahead)
+    right, above = picture_axes(towards)
+    offsets = wanted - eye
+    depth = np.maximum(-offsets @ towards, 0.05)
+    slope = max(float((np.abs(offsets @ above) / depth).max()), float((np.abs(offsets @ right) / depth).max()) / aspect)
+    fov = float(np.clip(2.0 * np.arctan(1.06 * slope), np.radians(38.0), np.radians(100.0)))
+    return pinhole(eye, eye + unit(ahead), fov)
+
+
+def beside(person: Vector, view: Camera, points: list[Vector], aspect: float) -> Camera:
+    """Slide a camera to the right, as far as all points stay in its picture, until the person has left it."""
+    position, look_at = np.array(view.position), np.array(view.look_at)
+    towards = unit(position - look_at)
+    right, _ = picture_axes(towards)
+
+    def to_border(point: Vector) -> float:
+        offset = point - position
+        return float(offset @ right) + aspect * np.tan(view.fov / 2.0) * float(-offset @ towards)
+
+    room = min(to_border(point) for point in points)
+    step = float(np.clip(to_border(person) + 0.30, 0.0, max(room - 0.03, 0.0))) * right
+    return pinhole(position + step, look_at + step, view.fov)
+
+
+def unit(vector: Vector) -> Vector:
+    """The vector at length one."""
+    return vector / np.linalg.norm(vector)
 
 
 def fitted(points: Float[np.ndarray, "P 3"], direction: Vector, aspect: float, margin: float) -> Camera:

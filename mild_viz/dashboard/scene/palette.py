@@ -38,7 +38,8 @@ class Palette:
     """One colour per meaning. Human is red and robot blue wherever they occur."""
 
     background: Rgb
-    """What the page paints behind the scene; faint lines are mixed towards it."""
+    """What is painted behind the scene; faint lines are mixed towards it. The boxes of viser's labels are always
+    light: on a mid-dark background they look less glaring than on the page's own near-black."""
     human: Rgb
     body: Rgb
     """Recorded joints that do not feed the model."""
@@ -47,6 +48,9 @@ class Palette:
     schematic_opacity: float
     robot: Rgb
     prediction: Rgb
+    """The decoded motion as a translucent arm."""
+    dashes: Rgb
+    """The predicted trajectory."""
     contact: Rgb
     distance: Rgb
     grid: Rgb
@@ -69,6 +73,7 @@ LIGHT = Palette(
     schematic_opacity=0.38,
     robot=rgb("#1B5FC1"),
     prediction=rgb("#58A3F5"),
+    dashes=rgb("#0B2F6B"),
     contact=rgb("#009E73"),
     distance=rgb("#30343B"),
     grid=rgb("#E7EAEE"),
@@ -78,19 +83,20 @@ LIGHT = Palette(
 )
 
 DARK = Palette(
-    background=(20, 20, 20),
+    background=rgb("#3A424D"),
     human=rgb("#FF5A6A"),
     body=rgb("#B4BCC7"),
     schematic=rgb("#9FB0C6"),
     schematic_opacity=0.34,
     robot=rgb("#4C8DFF"),
     prediction=rgb("#9CCBFF"),
+    dashes=rgb("#C6E2FF"),
     contact=rgb("#2BD6A0"),
     distance=rgb("#E6E9EE"),
-    grid=rgb("#26292E"),
-    grid_section=rgb("#343940"),
-    pedestal=rgb("#3B4149"),
-    frame=rgb("#6D7683"),
+    grid=rgb("#444D59"),
+    grid_section=rgb("#525C69"),
+    pedestal=rgb("#5E6874"),
+    frame=rgb("#8792A1"),
 )
 
 

@@ -1,4 +1,4 @@
-"""The gap between the robot's hand and the human's: a line with its length, and contact."""
+"""The gap between the robot's hand and the human's: a line with its length, and where they touch."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.rollout import Rollout
 
 ROOT = "/reach"
+
+TOUCH = 0.05
+"""A contact state is a phase of the interaction, not a measured touch: nearer than this [m] hands are marked."""
 
 
 class ReachView:
@@ -34,7 +37,7 @@ class ReachView:
         self._ends = np.nan_to_num(np.stack([rollout.end_effector, rollout.target], axis=1))
         self._texts = distance_texts(rollout)
         self._label_positions = np.nan_to_num(label_positions(rollout))
-        self._known = np.isfinite(rollout.hand_distance)
+        self._known = np.isfinite(rollout.hand_distance) & rollout.inference.tracked
         # One colour for the whole line, from its creation on: the browser does not recompile a line whose colours
         # change from one to many.
         self._colors = {
@@ -49,7 +52,7 @@ class ReachView:
             return
         known, contact = bool(self._known[n]), bool(self._rollout.contact[n])
         self._line.visible = self._text.visible = known
-        self._contact.visible = known and contact
+        self._contact.visible = known and contact and bool(self._rollout.hand_distance[n] < TOUCH)
         if not known:
             return
         self._line.points = self._ends[n : n + 1]
@@ -62,7 +65,7 @@ class ReachView:
 def distance_texts(rollout: Rollout) -> list[str]:
     """What is written at the line in every frame."""
     return [
-        f"{100.0 * distance:.1f} cm" + (" · contact" if contact else "")
+        f"{100.0 * distance:.1f} cm" + (" · contact state" if contact else "")
         for distance, contact in zip(rollout.hand_distance.tolist(), rollout.contact.tolist(), strict=True)
     ]
 

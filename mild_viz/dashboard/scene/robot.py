@@ -81,7 +81,7 @@ class RobotView:
     def show(
         self,
         frames: RobotFrames,
-        top: Float[np.ndarray, " 3"],
+        title: Float[np.ndarray, " 3"],
         controller: str,
         colors: Palette,
         visible: bool,
@@ -103,8 +103,8 @@ class RobotView:
         # Those that move follow with the frame.
         still = tuple(i for i in range(frames.poses.shape[1]) if i not in frames.moving)
         self._pose(self._solid, still, frames.poses[0])
-        self._title.position = self._caption.position = top + np.array([0.0, 0.0, 0.13])
-        self._caption.text = f"{controller} command"
+        self._title.position = self._caption.position = title
+        self._caption.text = f"{controller} command" + (" · pale: decoded, before IK" if self._show_ghost else "")
 
     def set_frame(self, n: int) -> None:
         """Show frame n."""

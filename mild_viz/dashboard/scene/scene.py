@@ -36,6 +36,7 @@ class Scene:
         self._latent_frames: LatentFrames | None = None
         self._layout: Layout | None = None
         self._frame = 0
+        self._presets: dict[int, tuple[str, Camera]] = {}
         self._ground = GroundView(server)
         colors = palette(dark)
         self._human = HumanView(server, colors)
@@ -66,12 +67,12 @@ class Scene:
         layout = scene_layout(rollout, figure, bounds)
         colors = palette(view.dark)
         with self._lock, self._server.atomic():
-            self._ground.show(layout.floor, bounds[0, 2], colors)
+            self._ground.show(layout.floor, float(bounds[0, 2]), colors, view.show_robot)
             if self._layout is None:
                 fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
-            self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human)
-            self._robot.show(arms, layout.robot_top, rollout.controller, colors, view.show_robot, view.ghost)
+            self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human, inference.tracked)
+            self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, view.ghost)
             self._reach.show(rollout, colors, view.show_human and view.show_robot)
             self._latent.show(frames, layout, colors, view.show_latent)
             self._figure, self._latent_frames = figure, frames
@@ -91,12 +92,28 @@ class Scene:
 
     def move_camera(self, client: viser.ClientHandle, name: str) -> None:
         """Take one client's camera to a preset, fitted to that client's canvas."""
-        view = self.camera(name, client.camera.image_width / max(client.camera.image_height, 1))
+        view = self.camera(name, canvas_aspect(client))
+        self._presets[client.client_id] = name, view
         with client.atomic():
             client.camera.position = view.position
             client.camera.look_at = view.look_at
             client.camera.up_direction = (0.0, 0.0, 1.0)
             client.camera.fov = view.fov
+
+    def refit_cameras(self) -> None:
+        """Fit each client's last preset ('both' at first) to the present layout and canvas.
+
+        A camera that a person has moved since stays where it is.
+        """
+        if self._layout is None:
+            return
+        clients = self._server.get_clients()
+        for client_id in set(self._presets) - set(clients):
+            self._presets.pop(client_id, None)
+        for client_id, client in clients.items():
+            name, last = self._presets.get(client_id, ("both", None))
+            if last is None or (is_at(client, last) and is_elsewhere(self.camera(name, canvas_aspect(client)), last)):
+                self.move_camera(client, name)
 
     def _set_frame(self, n: int) -> None:
         self._frame = n
@@ -111,6 +128,25 @@ def fill_initial_camera(server: viser.ViserServer, view: Camera) -> None:
     initial = server.initial_camera
     initial.position, initial.look_at = view.position, view.look_at
     initial.up, initial.fov = (0.0, 0.0, 1.0), view.fov
+
+
+def canvas_aspect(client: viser.ClientHandle) -> float:
+    """Width over height of a client's canvas."""
+    return client.camera.image_width / max(client.camera.image_height, 1)
+
+
+def is_at(client: viser.ClientHandle, view: Camera) -> bool:
+    """Whether a client's camera still is where it was put."""
+    camera = client.camera
+    near = {"rtol": 0.0, "atol": 0.02}
+    return np.allclose(camera.position, view.position, **near) and np.allclose(camera.look_at, view.look_at, **near)
+
+
+def is_elsewhere(view: Camera, last: Camera) -> bool:
+    """Whether two cameras differ by more than a hundredth of the distance to what they look at."""
+    here, there = np.array([view.position, view.look_at]), np.array([last.position, last.look_at])
+    step = float(np.linalg.norm(here - there, axis=1).max())
+    return step > 0.01 * float(np.linalg.norm(there[0] - there[1])) or abs(view.fov - last.fov) > 0.01
 
 
 def latent_view(view: ViewSettings | None) -> tuple[object, ...]:
