@@ -22,7 +22,9 @@ from mild_viz.rollout import Rollout
 HEADROOM = 0.22
 """Space [m] that the page's header needs above the titles."""
 
-HEADER = """<div style="position:fixed;z-index:2;top:10px;left:14px;right:14px;pointer-events:none;
+# viser's client fades its canvas out and in at every start of a loop; its own notice takes the top left corner.
+HEADER = """<style>canvas[data-engine]{{opacity:1!important}}</style>
+<div style="position:fixed;z-index:2;top:10px;right:14px;max-width:60%;text-align:right;pointer-events:none;
 font:13px/1.45 system-ui,sans-serif;color:{color}"><b>{title}</b> &nbsp; {line}<br>
 <span style="opacity:.75">{note}</span></div>"""
 
