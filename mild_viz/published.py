@@ -7,24 +7,28 @@ the names that such a file needs; each stands for an inert object that records i
 from __future__ import annotations
 
 import io
+import json
 import pickle
+import reprlib
 import zipfile
 from collections import OrderedDict
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_target, save_checkpoint
+from mild_viz.data.npz import ADMITTED as NUMPY_NAMES
+from mild_viz.data.npz import MAX_BYTES
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
-from mild_viz.settings import HUMAN_FEATURES, WINDOW
+from mild_viz.robot.robots import ROBOTS
+from mild_viz.settings import HUMAN_FEATURES, VARIANTS, WINDOW, choose
 
 ACTIONS = ("wave", "handshake", "rocket", "parachute")
 """Order of the authors' HMMs: the labels of the NuiSI file."""
-
-PEPPER_JOINTS = ("RShoulderPitch", "RShoulderRoll", "RElbowYaw", "RElbowRoll")
 
 LAYER_NAMES = {
     "_encoder.0": "encoder.0", "_encoder.2": "encoder.1", "post_mean": "posterior_mean",
@@ -57,10 +61,7 @@ ADMITTED: dict[tuple[str, str], Any] = {
     ("collections", "OrderedDict"): OrderedDict,
     ("pbdlib_torch.hmm", "HMM"): _inert("HMM"),
     ("argparse", "Namespace"): _inert("Namespace"),
-    ("_codecs", "encode"): _inert("encode"),
-    ("numpy", "ndarray"): _inert("ndarray"),
-    ("numpy", "dtype"): _inert("dtype"),
-    ("numpy.core.multiarray", "_reconstruct"): _inert("reconstruct"),
+    **{key: _inert(key[1]) for key in NUMPY_NAMES},
     **{("torch", name): _inert(name) for name in STORAGE_TYPES},
 }
 """The only names that the pickle may use, besides tensor reconstruction."""
@@ -90,9 +91,19 @@ class _Reader(pickle.Unpickler):
     def _tensor(self, storage: Any, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> np.ndarray:
         """A tensor as an array; `storage` is ('storage', type, key, device, count)."""
         _, kind, key, _, _ = storage
-        data = np.frombuffer(self._archive.read(f"{self._root}/data/{key}"), STORAGE_TYPES[kind.__name__])
+        name = getattr(kind, "__name__", None)
+        if name not in STORAGE_TYPES:
+            raise UserError(
+                f"{self._file}: tensor storage {key} is of type {reprlib.repr(kind)}; valid: {', '.join(STORAGE_TYPES)}"
+            )
+        data = np.frombuffer(self._archive.read(f"{self._root}/data/{key}"), STORAGE_TYPES[name])
+        if name == "BFloat16Storage":  # the upper half of a float32
+            data = (data.astype("<u4") << 16).view("<f4")
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-        if offset < 0 or any(step < 0 for step in stride) or (0 not in size and last >= len(data)):
+        if min(offset, *size, *stride, 0) < 0:
+            raise UserError(f"{self._file}: a tensor of storage {key} has a negative offset, size or stride")
+        # A stride of 0 repeats values: without the bound on the number, a short storage could fill the memory.
+        if prod(size) > len(data) or (0 not in size and last >= len(data)):
             raise UserError(f"{self._file}: tensor storage {key} is shorter than its tensor")
         steps = [step * data.itemsize for step in stride]
         return np.lib.stride_tricks.as_strided(data[offset:], size, steps, writeable=False).copy()
@@ -104,13 +115,19 @@ def read_pth(file: Path) -> dict[str, Any]:
     Raises:
         UserError: if the file is missing, truncated, not such an archive, or names anything else.
     """
-    if not file.is_file():
-        raise UserError(f"{file} does not exist")
     try:
+        if not file.is_file():
+            raise UserError(f"{file} does not exist or is no file; expected a published `.pth` file")
         with zipfile.ZipFile(file) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise UserError(f"{file} unpacks to more than {MAX_BYTES >> 30} GiB; expected a smaller archive")
             root = archive.namelist()[0].split("/")[0]
             content = _Reader(archive, root, file).load()
-    except (zipfile.BadZipFile, pickle.UnpicklingError, KeyError, IndexError, EOFError, ValueError, TypeError) as error:
+    except UserError:
+        raise
+    except OSError as error:
+        raise UserError(f"{file} cannot be read: {error.strerror or error}") from None
+    except Exception as error:  # a damaged archive or pickle can raise nearly anything
         raise UserError(f"{file} is not a readable PyTorch archive: {type(error).__name__}: {error}") from None
     needed = ("model_h", "model_r", "ssm", "args_r", "args_h")
     if not isinstance(content, dict) or any(key not in content for key in needed):
@@ -118,10 +135,15 @@ def read_pth(file: Path) -> dict[str, Any]:
     return content
 
 
-def variant_of(arguments: dict[str, Any]) -> str:
+def variant_of(arguments: dict[str, Any], where: str) -> str:
     """The variant that the file's own arguments describe (its name may say otherwise)."""
-    number = int(arguments["variant"])
-    return "v1" if number == 1 else f"v{number}.{2 if arguments['cov_cond'] else 1}"
+    number, covariance = arguments["variant"], arguments["cov_cond"]
+    if type(number) is not int or number not in (1, 2, 3) or type(covariance) is not bool:
+        raise UserError(
+            f"{where}: variant is {reprlib.repr(number)} and cov_cond is {reprlib.repr(covariance)}; "
+            "valid: 1, 2 or 3, and True or False"
+        )
+    return choose(where, "v1" if number == 1 else f"v{number}.{2 if covariance else 1}", list(VARIANTS))
 
 
 def _vae(state: dict[str, np.ndarray], input_size: int, latent_size: int, where: str) -> VAE:
@@ -154,19 +176,23 @@ def import_published(file: Path, out: Path) -> Checkpoint:
         UserError: if the file is not such a model, or `out` already holds something else.
     """
     check_checkpoint_target(out)
-    content = read_pth(file)
+    content, pepper = read_pth(file), ROBOTS["pepper"]
     try:
         arguments = content["args_r"].state
-        variant = variant_of(arguments)
+        variant = variant_of(arguments, f"{file}: args_r")
         n_joints, latent = int(arguments["num_joints"]), int(arguments["latent_dim"])
-        if n_joints != len(PEPPER_JOINTS):
+        if n_joints != len(pepper.joint_names):
             raise UserError(
-                f"{file} drives {n_joints} joints; only Pepper models ({len(PEPPER_JOINTS)}) can be imported"
+                f"{file} drives {n_joints} joints; only Pepper models ({len(pepper.joint_names)}) can be imported"
             )
         human_vae = _vae(content["model_h"], WINDOW * HUMAN_FEATURES, latent, f"{file}: model_h")
         robot_vae = _vae(content["model_r"], WINDOW * n_joints, latent, f"{file}: model_r")
         hmms = {a: _hmm(ssm.state, f"{file}: ssm {a}") for a, ssm in zip(ACTIONS, content["ssm"], strict=True)}
-    except (KeyError, AttributeError, TypeError, ValueError) as error:
+        recorded = {key: value for key, value in arguments.items() if isinstance(value, (str, int, float, bool))}
+        json.dumps(recorded)  # a number of thousands of digits cannot be written
+    except UserError:
+        raise
+    except Exception as error:  # its parts can be of any type and shape
         raise UserError(f"{file} is not a published MILD checkpoint: {type(error).__name__}: {error}") from None
     checkpoint = Checkpoint(
         path=out,
@@ -176,11 +202,11 @@ def import_published(file: Path, out: Path) -> Checkpoint:
         human_vae=human_vae,
         hmms=hmms,
         robot_vaes={variant: robot_vae},
-        robot=RobotInterface("pepper", PEPPER_JOINTS, "r_gripper"),
+        robot=RobotInterface("pepper", pepper.joint_names, pepper.end_effector),
         training={
             "command": f"mild-viz import-published {file.name} --out {out.name}",
             "source": "the authors' published file",
-            "arguments": {key: value for key, value in arguments.items() if isinstance(value, (str, int, float, bool))},
+            "arguments": recorded,
         },
     )
     readme = (

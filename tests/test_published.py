@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
@@ -38,8 +39,14 @@ def test_says_which_variant_it_really_is(published: Checkpoint) -> None:
     assert published.variants == ("v3.1",)  # its name says v3.2; its arguments say no covariance
     assert "v3.1" in (published.path / "README.md").read_text()
     assert json.loads((published.path / "config.json").read_text())["training"]["arguments"]["cov_cond"] is False
-    assert variant_of({"variant": 2, "cov_cond": True}) == "v2.2"
-    assert variant_of({"variant": 1, "cov_cond": False}) == "v1"
+    assert variant_of({"variant": 2, "cov_cond": True}, "file") == "v2.2"
+    assert variant_of({"variant": 1, "cov_cond": False}, "file") == "v1"
+
+
+@pytest.mark.parametrize(("number", "covariance"), [(7, False), (0, True), ("3", False), (10**40, False), (3, None)])
+def test_an_unknown_variant_is_named(number: Any, covariance: Any) -> None:
+    with pytest.raises(UserError, match="file: variant is .* and cov_cond is .*; valid: 1, 2 or 3"):
+        variant_of({"variant": number, "cov_cond": covariance}, "file")
 
 
 def test_gives_the_published_errors_on_nuisi(published: Checkpoint, dataset: Callable[[str], Any]) -> None:
@@ -79,17 +86,105 @@ def test_refuses_and_does_not_execute_anything_else(tmp_path: Path) -> None:
     assert not trace.exists() and not (tmp_path / "out").exists()
 
 
-def test_refuses_a_tensor_that_reaches_beyond_its_storage(tmp_path: Path) -> None:
-    file = tmp_path / "short.pth"
-    text = (
-        b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
-        b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQK\x00K\x63\x85K\x01\x85\x89NtR."
-    )
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("model/data.pkl", text)
-        archive.writestr("model/data/0", bytes(16))
-    with pytest.raises(UserError, match="shorter than its tensor"):
+class Global:
+    """Pickles as a name of a module, such as torch.FloatStorage, without importing it."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self.module, self.name = module, name
+
+
+class Tensor:
+    """Pickles as PyTorch writes a tensor."""
+
+    def __init__(self, kind: Any, offset: Any, size: tuple[Any, ...], stride: tuple[Any, ...]) -> None:
+        self.storage, self.rest = ("storage", kind, "0", "cpu", 4), (offset, size, stride, False, None)
+
+
+PurePickler: Any = pickle._Pickler  # the one in C saves no name that cannot be imported
+
+
+class Writer(PurePickler):
+    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
+        if isinstance(obj, Global):
+            self.write(f"c{obj.module}\n{obj.name}\n".encode())
+        elif isinstance(obj, Tensor):
+            self.save(Global("torch._utils", "_rebuild_tensor_v2"))
+            self.write(pickle.MARK)
+            self.save(obj.storage)
+            self.write(pickle.BINPERSID)
+            for part in obj.rest:
+                self.save(part)
+            self.write(pickle.TUPLE + pickle.REDUCE)
+        else:
+            super().save(obj, save_persistent_id)
+
+
+def write_model(file: Path, storage: bytes, **content: Any) -> None:
+    """An archive with the entries of a published model, and one tensor storage."""
+    stream = io.BytesIO()
+    Writer(stream, 2).dump(dict.fromkeys(("model_h", "model_r", "ssm", "args_r", "args_h")) | content)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("model/data.pkl", stream.getvalue())
+        archive.writestr("model/data/0", storage)
+
+
+def test_reads_every_kind_of_number(tmp_path: Path) -> None:
+    values = np.array([[1.5, -2.0], [0.25, 3e8]], dtype="<f4")
+    halves = (values.view("<u4") >> 16).astype("<u2")  # bfloat16: the upper half of a float32
+    for name, data in (("FloatStorage", values), ("BFloat16Storage", halves), ("DoubleStorage", values.astype("<f8"))):
+        write_model(tmp_path / "a.pth", data.tobytes(), model_h=Tensor(Global("torch", name), 0, (2, 2), (1, 2)))
+        got = read_pth(tmp_path / "a.pth")["model_h"]
+        assert got.dtype.kind == "f"
+        np.testing.assert_allclose(got, values.T, rtol=2**-7)
+
+
+@pytest.mark.parametrize("core", ["core", "_core"])
+def test_numpy_names_of_both_generations_are_read(tmp_path: Path, core: str) -> None:
+    write_model(tmp_path / "a.pth", b"", ssm=Global(f"numpy.{core}.multiarray", "_reconstruct"))
+    assert read_pth(tmp_path / "a.pth")["ssm"].__name__ == "_reconstruct"
+
+
+FLOATS = Global("torch", "FloatStorage")
+
+
+@pytest.mark.parametrize(
+    ("tensor", "message"),
+    [
+        (Tensor(FLOATS, 0, (99,), (1,)), "storage 0 is shorter than its tensor"),
+        (Tensor(FLOATS, 2, (3,), (1,)), "storage 0 is shorter than its tensor"),
+        (Tensor(FLOATS, 0, (10**12,), (0,)), "storage 0 is shorter than its tensor"),
+        (Tensor(FLOATS, 0, (2,), (10**30,)), "storage 0 is shorter than its tensor"),
+        (Tensor(FLOATS, 0, (0,), (10**30,)), "not a readable PyTorch archive"),
+        (Tensor(FLOATS, -1, (2,), (1,)), "negative offset, size or stride"),
+        (Tensor(FLOATS, 0, (-2, -2), (1, 1)), "negative offset, size or stride"),
+        (Tensor(FLOATS, 0, ("2",), (1,)), "not a readable PyTorch archive"),
+        (Tensor("FloatStorage", 0, (2,), (1,)), "storage 0 is of type 'FloatStorage'; valid: FloatStorage"),
+    ],
+)
+def test_a_tensor_that_cannot_be_is_named(tmp_path: Path, tensor: Tensor, message: str) -> None:
+    write_model(tmp_path / "odd.pth", bytes(16), model_h=tensor)
+    with pytest.raises(UserError, match=rf"odd\.pth.*{message}"):
+        read_pth(tmp_path / "odd.pth")
+
+
+def test_damaged_compression_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "damaged.pth"
+    write_model(file, bytes(16))
+    content = bytearray(file.read_bytes())
+    start = content.index(b"data.pkl") + len("data.pkl")
+    content[start : start + 8] = b"\xff" * 8
+    file.write_bytes(content)
+    with pytest.raises(UserError, match=r"damaged\.pth is not a readable PyTorch archive: error: Error -3"):
         read_pth(file)
+
+
+def test_entries_of_another_kind_are_named(tmp_path: Path) -> None:
+    write_model(tmp_path / "odd.pth", b"")
+    with pytest.raises(UserError, match=r"odd\.pth is not a published MILD checkpoint: AttributeError"):
+        import_published(tmp_path / "odd.pth", tmp_path / "out")
+    with pytest.raises(UserError, match="cannot be read|does not exist"):
+        import_published(tmp_path / ("x" * 300), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", None])

@@ -95,7 +95,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
             save_file(_tensors(checkpoint), built / WEIGHTS)
             (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
             (built / CONFIG).write_text(json.dumps(config_of(checkpoint), indent=2) + "\n", encoding="utf-8")
-            (built / README).write_text(readme, encoding="utf-8")
+            (built / README).write_text(readme, encoding="utf-8", errors="replace")
             try:
                 loaded = load_checkpoint(built)
             except UserError as error:
