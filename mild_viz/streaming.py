@@ -20,9 +20,7 @@ from mild_viz.pipeline import with_contact_states
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import VARIANTS, WINDOW, ControlSettings
-
-FEATURES = 18
+from mild_viz.settings import HUMAN_FEATURES, VARIANTS, WINDOW, ControlSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +97,7 @@ def stream_model(
 
 def start(model: StreamModel) -> Carry:
     """The state before the first observation."""
-    empty = np.full((WINDOW, FEATURES), np.nan)
+    empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
     return Carry(empty, 0, None, 0, None, None, initial_carry(model.robot.chain))
 
 
