@@ -29,7 +29,7 @@ def app(
     checkpoint: OptionalPath = None,
     dataset: str = "demo",
     action: OptionalText = None,
-    trial: int = 0,
+    trial: OptionalInt = None,
     variant: OptionalVariant = None,
     robot: str = "pepper",
     host: str = "127.0.0.1",
@@ -48,8 +48,8 @@ def app(
             Example: --dataset nuisi
         action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the handshake, if
             dataset and model have it, else their first one. Example: --action rocket
-        trial: Trial to show first: its number among the trials of the action, from 0, test trials before training
-            trials. Example: --trial 1
+        trial: Test trial to show first, from 0, as in rollout and record. Default: the first of the action.
+            Example: --trial 5
         variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
             has the table). Default: v3.1, if the model has it. Example: --variant v2.1
         robot: Robot to control: pepper, or the path of a URDF file with the joints that the model drives; meshes
@@ -197,7 +197,7 @@ def rollout(run: RunOptions, out: Path) -> None:
 def record(run: RunOptions, out: Path, csv: OptionalPath = None) -> None:
     """Record one trial as a web page that plays offline, and as a table.
 
-    Example: mild-viz record --dataset demo --trial 0 --out handshake.html --csv handshake.csv
+    Example: mild-viz record --dataset demo --trial 4 --out handshake.html --csv handshake.csv
 
     Args:
         run: What to run.

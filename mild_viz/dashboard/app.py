@@ -107,22 +107,25 @@ class Dashboard:
 
 
 def first_settings(
-    dataset: Dataset, checkpoint: Checkpoint, action: str | None, trial: int, variant: str | None
+    dataset: Dataset, checkpoint: Checkpoint, action: str | None, trial: int | None, variant: str | None
 ) -> InferSettings:
-    """What is shown first: the `trial`-th test trial of an action that both dataset and model know."""
+    """What is shown first: test trial `trial`, else the first one of an action that both dataset and model know."""
     shared = tuple(name for name in dataset.actions if name in checkpoint.actions)
     if not shared:
         raise UserError(
             f"checkpoint {checkpoint.name} knows {', '.join(checkpoint.actions)}; "
             f"dataset '{dataset.name}' holds {', '.join(dataset.actions)}"
         )
-    action = choose(f"{dataset.name}: action", action or preferred(shared), shared)
+    asked = None if trial is None else dataset.trial("test", trial).action
+    action = choose(f"{dataset.name}: action", action or asked or preferred(shared), shared)
     trials = [one for one in dataset.test + dataset.train if one.action == action]
-    if not 0 <= trial < len(trials):
-        raise UserError(f"{dataset.name} has no {action} trial {trial}; valid: 0 to {len(trials) - 1}")
+    if trial is not None:
+        trials = [one for one in trials if one.split == "test" and one.index == trial]
+        if not trials:
+            raise UserError(f"{dataset.name}: test trial {trial} is a {asked}, not a {action}; leave one of both out")
     fallback = "v3.1" if "v3.1" in checkpoint.variants else checkpoint.variants[0]
     variant = choose(f"checkpoint {checkpoint.name}: variant", variant or fallback, checkpoint.variants)
-    return InferSettings(dataset.name, trials[trial].split, trials[trial].index, variant)
+    return InferSettings(dataset.name, trials[0].split, trials[0].index, variant)
 
 
 def preferred(actions: tuple[str, ...]) -> str:
@@ -134,7 +137,7 @@ def open_dashboard(
     checkpoint: Path | None = None,
     dataset: str = "demo",
     action: str | None = None,
-    trial: int = 0,
+    trial: int | None = None,
     variant: str | None = None,
     robot: str = "pepper",
     host: str = "127.0.0.1",
@@ -164,7 +167,7 @@ def run(
     checkpoint: Path | None = None,
     dataset: str = "demo",
     action: str | None = None,
-    trial: int = 0,
+    trial: int | None = None,
     variant: str | None = None,
     robot: str = "pepper",
     host: str = "127.0.0.1",
