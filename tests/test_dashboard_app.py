@@ -96,11 +96,15 @@ def test_a_model_of_two_humans_drives_no_robot(tmp_path: Path, model: Path) -> N
 
 def test_the_first_trial_is_a_test_trial_of_the_action(model: Path) -> None:
     demo, checkpoint = load_dataset("demo"), load_checkpoint(model)
-    first = first_settings(demo, checkpoint, None, 0, None)
+    first = first_settings(demo, checkpoint, None, None, None)
     trial = demo.trial(first.split, first.trial)
     assert (first.split, trial.action, first.variant) == ("test", "handshake", "v3.1")
-    n_test = sum(trial.action == "wave" for trial in demo.test)
-    assert first_settings(demo, checkpoint, "wave", n_test, "v1").split == "train"
+    rocket = next(trial for trial in demo.test if trial.action == "rocket")
+    assert first_settings(demo, checkpoint, None, rocket.index, "v1").trial == rocket.index
+    with pytest.raises(UserError, match=f"test trial {rocket.index} is a rocket, not a wave"):
+        first_settings(demo, checkpoint, "wave", rocket.index, None)
+    with pytest.raises(UserError, match="has no trial 99; valid: 0 to"):
+        first_settings(demo, checkpoint, None, 99, None)
 
 
 def test_only_what_fits_is_offered(
@@ -141,6 +145,43 @@ def test_switching_the_dataset_brings_its_model_actions_and_trials(
     dropdown.value = "demo"
     session.mark_dirty()
     assert session.wait_idle() and session.choice.trial.dataset == "demo"
+
+
+def test_ticks_are_compared_with_what_the_model_has_stored(dashboard: Dashboard, model: Path) -> None:
+    states, session = dashboard.controls._states, dashboard.session
+    assert states.save.disabled and "Saved:" in states._saved.content
+    box = states._boxes[0]
+    box.value = not box.value
+    session.mark_dirty()
+    assert session.wait_idle()
+    assert not states.save.disabled and "Not saved" in states._saved.content
+    dashboard.controls._save_contact_states()
+    assert states.save.disabled and "the default of model demo-copy" in states._saved.content
+    box.value = not box.value
+    session.mark_dirty()
+    assert session.wait_idle()
+    assert not states.save.disabled and "Not saved" in states._saved.content
+    dashboard.controls._save_contact_states()
+    assert states.save.disabled
+
+
+def test_a_copy_goes_by_its_own_name(dashboard: Dashboard) -> None:
+    assert "model demo-copy, controller" in dashboard.controls._header.content
+
+
+def test_what_has_no_effect_is_disabled(dashboard: Dashboard) -> None:
+    robot, session = dashboard.controls._robot, dashboard.session
+    assert not (robot._lambda_x.disabled or robot._lambda_q.disabled or robot._stiffness.disabled)
+    robot._controller.value = "mild"
+    dashboard.controls._trial._action.value = "wave"
+    session.mark_dirty()
+    assert session.wait_idle() and session.error is None
+    assert robot._lambda_x.disabled and robot._lambda_q.disabled and robot._stiffness.disabled
+    assert "<b>wave</b> has no contact" in dashboard.controls._states._intro.content
+    robot._controller.value = "mild-ik"
+    dashboard.controls._trial._action.value = "handshake"
+    session.mark_dirty()
+    assert session.wait_idle() and session.error is None
 
 
 def test_contact_states_that_cannot_be_saved_say_so(dashboard: Dashboard, model: Path) -> None:

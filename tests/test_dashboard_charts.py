@@ -65,6 +65,16 @@ def test_who_waves_is_not_in_contact() -> None:
     assert "waving" in html and ">contact<" not in html
 
 
+def test_stiffness_is_drawn_where_it_varies() -> None:
+    inference = make_inference(n=60)
+    assert "stiffness" not in charts.draw_lanes(make_rollout(inference), "human")["distance"]
+    stiffness = np.ones((60, 4))
+    stiffness[20:40] = 0.4
+    html = charts.draw_lanes(make_rollout(inference, stiffness=stiffness), "human")["distance"]
+    (line,) = (node for node in parse(html).iter("polyline") if node.get("class") == "mv-stiffness")
+    assert points(line)[30, 1] == pytest.approx((1 - 0.4 / 1.06) * charts.HEIGHT, abs=0.6)
+
+
 def test_alpha_follows_the_chosen_mode() -> None:
     other = np.log(np.tile([0.2, 0.3, 0.5], (60, 1)))
     inference = make_inference(n=60, log_alpha_unobserved=other)

@@ -174,7 +174,8 @@ def test_recordings_are_downloaded_and_open(
     tab(page, "Record")
     with page.expect_download(timeout=60_000) as table:
         page.get_by_role("button", name="Record table (CSV)").click()
-    assert table.value.suggested_filename == f"demo-handshake-test-{shown(dashboard).inference.trial}-v3.1-mild-ik.csv"
+    trial = shown(dashboard).inference.trial
+    assert table.value.suggested_filename == f"demo-handshake-test-{trial}-demo-copy-v3.1-mild-ik.csv"
     table.value.save_as(tmp_path / "table.csv")
     with open(tmp_path / "table.csv", newline="") as file:
         rows = list(csv.reader(file))

@@ -21,6 +21,7 @@ WIDTH, HEIGHT = 1000, 1000
 """Of a picture, in its own units: it is stretched to the lane."""
 LANES = ("states", "alpha", "joints", "distance", "axis")
 MAX_POINTS = 600
+SEEK = " (drag the frame bar to go there)"
 PHASE_COLORS = tuple(
     f"color-mix(in srgb, var(--mantine-color-text) {share}%, var(--mantine-color-body))" for share in (0, 30, 75, 15)
 )
@@ -56,8 +57,10 @@ def cursor_html(fraction: float) -> str:
 
 def phase_names(action: str) -> dict[int, str]:
     """Names of the true phases; where the partners do not touch, the third one is no contact."""
-    names = dict(enumerate(PHASES))
-    return names if action in CONTACT_ACTIONS else {**names, PHASES.index("contact"): "waving"}
+    names: dict[int, str] = {phase: name for phase, name in enumerate(PHASES)}
+    if action not in CONTACT_ACTIONS:
+        names[PHASES.index("contact")] = "waving"
+    return names
 
 
 def runs(values: Int[np.ndarray, " N"] | Bool[np.ndarray, " N"]) -> list[tuple[int, int, int]]:
@@ -127,8 +130,8 @@ def _strip(values: Int[np.ndarray, " N"], css: str, colors: dict[int, str], name
             ink = "var(--mantine-color-body)"
         shown = name if width > 0.75 * len(name) + 0.8 else ""
         segments.append(
-            f'<div class="mv-segment" title="{name}" style="left:{left:.2f}%;width:{width:.2f}%;background:{color};'
-            f'color:{ink}">{shown}</div>'
+            f'<div class="mv-segment" title="{name}{SEEK}" style="left:{left:.2f}%;width:{width:.2f}%;'
+            f'background:{color};color:{ink}">{shown}</div>'
         )
     return f'<div class="{css}">{"".join(segments)}</div>'
 
@@ -191,18 +194,24 @@ def _joints(rollout: Rollout) -> str:
 
 
 def _distance(rollout: Rollout) -> str:
-    """From the robot's hand to the human's wrist, broken where the wrist was not seen."""
+    """From the robot's hand to the human's wrist, broken where the wrist was not seen; and the stiffness, if it varies.
+
+    The height of the lane is 100 % of stiffness.
+    """
     tracked = rollout.inference.tracked
     centimetres = np.where(tracked, 100.0 * rollout.hand_distance, np.nan)
     known = centimetres[np.isfinite(centimetres)]
     high = float(known.max()) if len(known) else 1.0
+    stiffness = rollout.stiffness.min(axis=1)
+    varies = bool((stiffness < 1.0).any())
     plot = _svg(
         _grid(rollout.inference)
         + _bands(rollout.contact, "mv-touch")
         + _bands(~tracked, "mv-lost")
         + _line(centimetres, 0.0, 1.06 * high, "mv-commanded")
+        + (_line(stiffness, 0.0, 1.06, "mv-stiffness") if varies else "")
     )
-    return _lane("Hand distance", "robot hand to wrist", plot, (f"{high:.0f} cm", "0"))
+    return _lane("Robot hand to wrist", "dotted: stiffness" if varies else "", plot, (f"{high:.0f} cm", "0"))
 
 
 def tick_times(start: float, end: float) -> list[float]:

@@ -60,7 +60,7 @@ class Controls:
         with tabs.add_tab("View"):
             self._view = ViewTab(gui, changed, move_camera)
         with tabs.add_tab("Record"):
-            RecordTab(gui, lambda: self._rollout, write_html, write_csv)
+            RecordTab(gui, lambda: self._rollout, lambda: self._model_of(self._choice), write_html, write_csv)
 
     def read(self) -> Choice:
         """What the widgets say, checked. Raises UserError naming the widget."""
@@ -102,9 +102,9 @@ class Controls:
         for client in self._server.get_clients().values():
             client.add_notification("This could not be done", sentence(message), color="red", auto_close_seconds=8.0)
 
-    def _model_of(self, choice: Choice) -> str:
+    def _model_of(self, choice: Choice | None) -> str:
         """The model's name on the page: a copy of a shipped model calls itself as the original does."""
-        return self._catalog.name_of(choice.checkpoint.path)
+        return "" if choice is None else self._catalog.name_of(choice.checkpoint.path)
 
     def _compare_contact_states(self, ticked: frozenset[int], choice: Choice) -> None:
         action = choice.trial.action

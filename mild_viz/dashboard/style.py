@@ -35,8 +35,8 @@ TIMELINE_CSS = """
 .mv-timeline { display: none; }
 div:has(> div > .mv-timeline) {
   display: grid; grid-template-columns: auto auto auto minmax(0, 1fr); align-items: center; height: 100%;
-  grid-template-rows: 28px 24px auto minmax(30px, 5fr) minmax(60px, 14fr) minmax(30px, 5fr) 15px;
-  padding: 4px 0 2px 0 !important; box-sizing: border-box;
+  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
+  padding: 2px 0 0 0 !important; box-sizing: border-box;
 }
 div:has(> div > .mv-timeline) > div { padding-bottom: 0 !important; }
 div:has(> div > .mv-timeline) > div:has(> .mv-lane) { grid-column: 1 / -1; height: 100%; min-height: 0; }
@@ -87,6 +87,7 @@ CHART_CSS = """
 .mv-plot .mv-lost { fill: var(--mantine-color-dimmed); opacity: 0.35; }
 .mv-plot .mv-touch { fill: var(--mantine-color-text); opacity: 0.08; }
 .mv-commanded { stroke: var(--mantine-color-text); }
+.mv-stiffness { stroke: var(--mantine-color-dimmed); stroke-dasharray: 2 3; }
 .mv-decoded { stroke: #1c7ed6; stroke-dasharray: 5 3; }
 .mv-truth { stroke: #f08c00; stroke-width: 3 !important; opacity: 0.55; }
 .mv-cursor {

@@ -18,9 +18,14 @@ class RecordTab:
     """Two buttons. Files are made in a temporary folder: no name or path from a browser reaches the disk."""
 
     def __init__(
-        self, gui: viser.GuiApi, rollout: Callable[[], Rollout | None], write_html: Writer, write_csv: Writer
+        self,
+        gui: viser.GuiApi,
+        rollout: Callable[[], Rollout | None],
+        model: Callable[[], str],
+        write_html: Writer,
+        write_csv: Writer,
     ) -> None:
-        self._rollout = rollout
+        self._rollout, self._model = rollout, model
         self._busy = threading.Lock()
         gui.add_html(
             '<div class="mv-note">Recordings hold the trial as it is shown now: model, controller, contact states, '
@@ -48,7 +53,9 @@ class RecordTab:
             with TemporaryDirectory(prefix="mild_viz.") as folder:
                 path = Path(folder) / f"recording.{suffix}"
                 write(path)
-                client.send_file_download(file_name(rollout, suffix), path.read_bytes(), save_immediately=True)
+                client.send_file_download(
+                    file_name(rollout, self._model(), suffix), path.read_bytes(), save_immediately=True
+                )
         except Exception as error:  # also a browser that closed in the meantime: the page must not hang on it
             client.add_notification("The recording failed", str(error), color="red")
             raise
@@ -57,8 +64,8 @@ class RecordTab:
             self._busy.release()
 
 
-def file_name(rollout: Rollout, suffix: str) -> str:
-    """Says what was recorded: 'demo-handshake-test-3-v3.1-mild-ik.html'."""
+def file_name(rollout: Rollout, model: str, suffix: str) -> str:
+    """Says what was recorded: 'demo-handshake-test-3-my-model-v3.1-mild-ik.html'. `model` is its name on the page."""
     inference = rollout.inference
-    parts = (inference.dataset, inference.action, inference.split, str(inference.trial), inference.variant)
-    return f"{'-'.join((*parts, rollout.controller))}.{suffix}"
+    trial = (inference.dataset, inference.action, inference.split, str(inference.trial))
+    return f"{'-'.join((*trial, Path(model).name, inference.variant, rollout.controller))}.{suffix}"
