@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import pickletools
 import reprlib
 import zipfile
 from collections import OrderedDict
@@ -71,7 +72,12 @@ class _Reader(pickle.Unpickler):
     """Unpickles a `.pth` archive with `ADMITTED` names only."""
 
     def __init__(self, archive: zipfile.ZipFile, root: str, file: Path) -> None:
-        super().__init__(io.BytesIO(archive.read(f"{root}/data.pkl")))
+        content = archive.read(f"{root}/data.pkl")
+        super().__init__(io.BytesIO(content))
+        # The unpickler makes room for every index up to the one that is named: one damaged byte can ask for 64 GB.
+        for operation, argument, _ in pickletools.genops(content):
+            if operation.name in ("PUT", "LONG_BINPUT") and not 0 <= (argument or 0) <= len(content):
+                raise UserError(f"{file} is not a readable PyTorch archive: memo index {argument} is out of range")
         self._archive, self._root, self._file = archive, root, file
 
     def find_class(self, module_name: str, global_name: str) -> Any:

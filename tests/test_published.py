@@ -178,6 +178,13 @@ def test_damaged_compression_is_named(tmp_path: Path) -> None:
         read_pth(file)
 
 
+def test_an_index_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.pth", "w") as archive:
+        archive.writestr("model/data.pkl", b"\x80\x02}r\xff\xff\xff\xff.")
+    with pytest.raises(UserError, match=r"a\.pth .*memo index 4294967295 is out of range"):
+        read_pth(tmp_path / "a.pth")
+
+
 def test_entries_of_another_kind_are_named(tmp_path: Path) -> None:
     write_model(tmp_path / "odd.pth", b"")
     with pytest.raises(UserError, match=r"odd\.pth is not a published MILD checkpoint: AttributeError"):
