@@ -13,6 +13,7 @@ from scene_rollouts import N_STATES, scene_inference, scene_rollout
 
 from mild_viz.dashboard.recorder import record_csv, record_html, titled
 from mild_viz.dashboard.view import ViewSettings
+from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.rollout import Rollout
 
@@ -71,7 +72,7 @@ def test_a_file_is_replaced_whole_or_stays(rollout: Rollout, tmp_path: Path) -> 
     path.write_text("old")
     record_csv(rollout, path)
     assert path.read_text().startswith("time,") and list(tmp_path.iterdir()) == [path]
-    with pytest.raises(OSError):
+    with pytest.raises(UserError, match="choose another place"):
         record_csv(rollout, tmp_path / "missing" / "trial.csv")
     assert list(tmp_path.iterdir()) == [path]
 
@@ -107,6 +108,8 @@ def test_the_page_plays_without_a_network(
             seen.add(tuple(page.evaluate(opacity)))
             time.sleep(0.2)
         assert len(seen) >= 3, "the opacities must change as it plays"
+        canvas = "[...document.querySelectorAll('canvas[data-engine]')].map(one => getComputedStyle(one).opacity)"
+        assert page.evaluate(canvas) == ["1"], "the picture must not fade at every loop"
         nodes = page.evaluate(f"Object.keys({state})")
         assert {"/human/joints", "/robot/solid/RForeArm", "/latent/path_human", "/reach/line"} <= set(nodes)
         assert page.title() == f"demo/test/{rollout.inference.trial} · handshake"

@@ -118,11 +118,13 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
 
 
 def plot_points(layout: Layout) -> list[Vector]:
-    """The corners of the latent plot's box, those below with room for the names of the axes."""
+    """The corners of the latent plot's box, with room for the names of the axes below and at the upright edge."""
     half = 0.5 * PLOT_SIZE
     cos, sin = np.cos(layout.plot_yaw), np.sin(layout.plot_yaw)
-    return [
-        layout.plot_centre + reach * (a * np.array([cos, sin, 0.0]) + b * np.array([-sin, cos, 0.0])) + [0.0, 0.0, z]
+    x, y = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
+    upright = layout.plot_centre - (half + 0.20) * (x + y) + [0.0, 0.0, 0.55 * half]
+    return [upright] + [
+        layout.plot_centre + reach * (a * x + b * y) + [0.0, 0.0, z]
         for a in (-1.0, 1.0)
         for b in (-1.0, 1.0)
         for reach, z in ((half, half), (half + 0.14, -half - 0.10))
@@ -133,7 +135,7 @@ def over_shoulder(layout: Layout, aspect: float) -> Camera:
     """What the person sees: just before the right eye, so that neither head nor title is in the way."""
     up = np.array([0.0, 0.0, 1.0])
     eye = layout.human_eye - 0.12 * layout.forward - 0.10 * layout.side + 0.05 * up
-    wanted = np.array([layout.robot_top + 0.10 * up, layout.hand - 0.12 * up])
+    wanted = np.array([layout.robot_top + 0.10 * up, layout.hand - 0.22 * up])
     ahead = unit(wanted[0] - eye) + unit(wanted[1] - eye)
     towards = -unit(ahead)
     right, above = picture_axes(towards)

@@ -138,8 +138,8 @@ def canvas_aspect(client: viser.ClientHandle) -> float:
 def is_at(client: viser.ClientHandle, view: Camera) -> bool:
     """Whether a client's camera still is where it was put."""
     camera = client.camera
-    near = {"rtol": 0.0, "atol": 0.02}
-    return np.allclose(camera.position, view.position, **near) and np.allclose(camera.look_at, view.look_at, **near)
+    now, then = np.array([camera.position, camera.look_at]), np.array([view.position, view.look_at])
+    return bool(np.abs(now - then).max() < 0.02)
 
 
 def is_elsewhere(view: Camera, last: Camera) -> bool:
