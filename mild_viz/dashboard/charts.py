@@ -57,7 +57,7 @@ def cursor_html(fraction: float) -> str:
 
 def phase_names(action: str) -> dict[int, str]:
     """Names of the true phases; where the partners do not touch, the third one is no contact."""
-    names: dict[int, str] = {phase: name for phase, name in enumerate(PHASES)}
+    names: dict[int, str] = dict(enumerate(PHASES))
     if action not in CONTACT_ACTIONS:
         names[PHASES.index("contact")] = "waving"
     return names
