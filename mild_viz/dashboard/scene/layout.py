@@ -92,7 +92,7 @@ def make_layout(
     away = T_world_human[:3, 3] * [1.0, 1.0, 0.0]
     distance = float(np.linalg.norm(away))
     forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
-    centre = forward * (max(distance, 0.75) + 1.25)
+    centre = forward * (max(distance, 0.75) + 1.40)
     centre[2] = floor + 0.98
     yaw = float(np.arctan2(forward[1], forward[0])) + PLOT_TURN
     return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
@@ -122,7 +122,7 @@ def plot_points(layout: Layout) -> list[Vector]:
     half = 0.5 * PLOT_SIZE
     cos, sin = np.cos(layout.plot_yaw), np.sin(layout.plot_yaw)
     x, y = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
-    upright = layout.plot_centre - (half + 0.20) * (x + y) + [0.0, 0.0, 0.55 * half]
+    upright = layout.plot_centre - (half + 0.15) * (x + y) + [0.0, 0.0, 0.55 * half]
     return [upright] + [
         layout.plot_centre + reach * (a * x + b * y) + [0.0, 0.0, z]
         for a in (-1.0, 1.0)
