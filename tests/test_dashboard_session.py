@@ -86,11 +86,11 @@ def test_a_control_setting_reruns_only_the_control(bench: Bench) -> None:
 
 def test_a_view_setting_reruns_nothing(bench: Bench) -> None:
     before = bench.session.rollout
-    bench.choice = with_view(bench.choice, sigma=2.0)
+    bench.choice = with_view(bench.choice, sigma=3.0)
     bench.session.mark_dirty()
     bench.settle()
     assert bench.counts == (1, 1, 2)
-    assert bench.session.rollout is before and bench.shown[-1][1].view.sigma == 2.0
+    assert bench.session.rollout is before and bench.shown[-1][1].view.sigma == 3.0
 
 
 def test_no_change_does_nothing(bench: Bench) -> None:
