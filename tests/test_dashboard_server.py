@@ -142,3 +142,9 @@ def test_what_the_program_sets_does_not_count_as_a_change(server: viser.ViserSer
     on_person(slider, lambda: changes.append(None))
     slider.value = 1.5
     assert changes == []
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 70])
+def test_a_host_that_is_no_name_is_named(host: str) -> None:
+    with pytest.raises(UserError, match="is unknown; valid: an address of this machine"):
+        check_port(host, 8080)

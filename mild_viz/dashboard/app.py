@@ -146,7 +146,7 @@ def open_dashboard(
     """Load model, data and robot, and start the page. Returns while the first rollout is computed.
 
     Raises:
-        UserError: for anything that was given and cannot be used, before a server is started.
+        UserError: for anything that was given and cannot be used.
     """
     check_port(host, port)
     recordings = load_dataset(dataset)

@@ -39,7 +39,7 @@ def _can_bind(host: str, port: int) -> bool:
     """Whether a server could listen there. Raises UserError for an address that is not this machine's."""
     try:
         infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    except OSError:
+    except (OSError, UnicodeError):  # UnicodeError: a label that is empty or too long for any name
         raise UserError(f"host '{host}' is unknown; valid: an address of this machine, such as 127.0.0.1") from None
     for family, kind, protocol, _, address in infos:
         with socket.socket(family, kind, protocol) as probe:
