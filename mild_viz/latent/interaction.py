@@ -1,4 +1,4 @@
-"""One trained model: encode -> filter -> condition -> decode, over a whole trial or from one observation to the next."""
+"""One trained model: encode -> filter -> condition -> decode, over a whole trial or one observation at a time."""
 
 from __future__ import annotations
 
