@@ -14,7 +14,7 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission
+from mild_viz.latent.hmm import HMM, FilterCarry, continue_filter, log_emission
 from mild_viz.latent.vae import VAE
 from mild_viz.pipeline import with_contact_states
 from mild_viz.robot.contact import in_frame
@@ -52,7 +52,7 @@ class Carry(NamedTuple):
     """Frames since it was seen."""
     previous: Float[np.ndarray, " 9"] | None
     """The previous frame's filled position."""
-    log_alpha: Float[np.ndarray, " S"] | None
+    filter: FilterCarry | None
     control: ControlCarry
 
 
@@ -113,7 +113,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     mean, std = model.human_vae.encode(window)
-    log_alpha, _ = forward_filter(model.human_hmm, log_emission(model.human_hmm, mean), seen.log_alpha)
+    log_alpha, filtered = continue_filter(model.human_hmm, log_emission(model.human_hmm, mean), seen.filter)
     latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
     decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
@@ -130,7 +130,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
         contact=bool(result.contact[0]),
         stiffness=result.stiffness[0],
     )
-    return seen._replace(log_alpha=log_alpha[0], control=result.carry), command
+    return seen._replace(filter=filtered, control=result.carry), command
 
 
 def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
@@ -144,4 +144,4 @@ def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) ->
     position = filled.reshape(9)
     velocity = np.zeros(9) if carry.previous is None else position - carry.previous
     features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.log_alpha, carry.control)
+    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.filter, carry.control)

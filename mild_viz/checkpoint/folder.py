@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save_file
 
 from mild_viz.checkpoint.config import (
     SCHEMA_VERSION,
+    Config,
     check_states,
     config_of,
     is_config,
@@ -26,7 +27,8 @@ from mild_viz.checkpoint.config import (
 from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.files import write_atomically
-from mild_viz.latent.hmm import HMM, check_hmm
+from mild_viz.latent.hmm import HMM
+from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.latent.vae import make_vae
 from mild_viz.settings import HUMAN_FEATURES, WINDOW
 
@@ -37,8 +39,7 @@ FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
 def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     tensors = {f"human/{name}": value for name, value in checkpoint.human_vae.weights.items()}
     for action, hmm in checkpoint.hmms.items():
-        for name in HMM.__dataclass_fields__:
-            tensors[f"hmm/{action}/{name}"] = getattr(hmm, name)
+        tensors |= {f"hmm/{action}/{field.name}": getattr(hmm, field.name) for field in fields(hmm)}
     for variant, vae in checkpoint.robot_vaes.items():
         tensors |= {f"robot/{variant}/{name}": value for name, value in vae.weights.items()}
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}
@@ -116,20 +117,23 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
     return replace(loaded, path=path)
 
 
-def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, n_states: int, size: int, where: str) -> HMM:
+def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, config: Config, where: str) -> HMM:
+    n_states, size = config.n_states, 2 * config.latent_size
+    state_model = STATE_MODELS[config.state_model]
     shapes = {
         "initial_probs": (n_states,), "transition_matrix": (n_states, n_states),
         "emission_means": (n_states, size), "emission_covariances": (n_states, size, size),
+        "duration_means": (n_states,), "duration_stds": (n_states,),
     }  # fmt: skip
     values = {}
-    for name, shape in shapes.items():
-        key = f"hmm/{action}/{name}"
+    for name in (field.name for field in fields(state_model.kind)):
+        key, shape = f"hmm/{action}/{name}", shapes[name]
         if key not in tensors:
             raise UserError(f"{where}: tensor '{key}' is missing")
         if tensors[key].shape != shape:
             raise UserError(f"{where}: tensor '{key}' has shape {tensors[key].shape}, expected {shape}")
         values[name] = tensors[key].astype(np.float64)
-    return check_hmm(HMM(**values), f"{where}: hmm/{action}")
+    return state_model.check(state_model.kind(**values), f"{where}: hmm/{action}")
 
 
 def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -167,7 +171,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         dataset=config.dataset,
         dataset_checksum=config.dataset_checksum,
         human_vae=make_vae(_part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
-        hmms={action: _read_hmm(tensors, action, config.n_states, 2 * latent, str(file)) for action in config.actions},
+        hmms={action: _read_hmm(tensors, action, config, str(file)) for action in config.actions},
         robot_vaes={
             name: make_vae(_part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
             for name in config.variants

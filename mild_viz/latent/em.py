@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -134,16 +134,22 @@ def em_step(
 
 
 def fit(
-    hmm: HMM, sequences: Sequence[Float[np.ndarray, "_ D"]], floor: float, n_iterations: int, tolerance: float = 1e-3
+    hmm: HMM,
+    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    floor: float,
+    n_iterations: int,
+    tolerance: float = 1e-3,
+    step: Callable[[Any, Sequence[np.ndarray], float], tuple[HMM, float]] = em_step,
 ) -> tuple[HMM, list[float]]:
     """EM from a start until the log-likelihood per step rises by less than `tolerance`, or `n_iterations`.
 
-    Returns the model and the log-likelihood before every iteration.
+    `step` is one iteration for the start's kind of model. Returns the model and the log-likelihood before every
+    iteration.
     """
     n_steps = sum(map(len, sequences))
     history: list[float] = []
     for _ in range(n_iterations):
-        hmm, total = em_step(hmm, sequences, floor)
+        hmm, total = step(hmm, sequences, floor)
         converged = bool(history) and abs(total - history[-1]) < tolerance * n_steps
         history.append(total)
         if converged:
