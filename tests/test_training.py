@@ -221,7 +221,7 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
     assert (again.path / "weights.safetensors").read_bytes() == (out / "weights.safetensors").read_bytes()
 
     human = train("demo", "hhi", seeds=1, epochs=1, out=tmp_path / "human")
-    assert human.robot is None and load_checkpoint(human.path).variants == ()
+    assert human.robot is None and load_checkpoint(human.path).variants == ("v1",)
 
 
 def test_wrong_options_are_named(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -41,17 +42,21 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int,
     )
 
 
-def em_step(
-    hmm: HMM,
-    sequences: Sequence[Float[np.ndarray, "_ D"]],
-    floor: float,
-    transition_floor: float = TRANSITION_FLOOR,
-) -> tuple[HMM, float]:
-    """One iteration of EM. Returns the new model and the log-likelihood of the one that was given.
+class Expectation(NamedTuple):
+    """What the E-step finds: the posterior of the hidden states, given every sequence whole."""
 
-    `floor` is added to the diagonal of every covariance (the paper's regularisation), once an iteration.
-    """
-    n_states, size = hmm.emission_means.shape
+    gamma: Float[np.ndarray, "N S"]
+    """p(state at n given z_{1:N}), the rows of all sequences one after the other."""
+    transitions: Float[np.ndarray, "S S"]
+    """Expected number of transitions j -> i at [j, i], over all sequences."""
+    initial: Float[np.ndarray, " S"]
+    """Expected number of sequences that start in each state."""
+    log_likelihood: float
+
+
+def expectation(hmm: HMM, sequences: Sequence[Float[np.ndarray, "_ D"]]) -> Expectation:
+    """The E-step of EM: forward-backward over every sequence."""
+    n_states = hmm.n_states
     stacked = np.concatenate(sequences)
     likelihood = log_emission(hmm, stacked)
     gamma = np.empty((len(stacked), n_states))
@@ -71,7 +76,18 @@ def em_step(
         initial += gamma[start]
         total += log_probability
         start += len(sequence)
+    return Expectation(gamma, counts, initial, total)
 
+
+def maximise_emissions(
+    sequences: Sequence[Float[np.ndarray, "_ D"]], gamma: Float[np.ndarray, "N S"], floor: float
+) -> tuple[Float[np.ndarray, "S D"], Float[np.ndarray, "S D D"]]:
+    """The M-step of the Gaussians: means and covariances of every state, each step weighted by `gamma`.
+
+    A state that explains next to nothing is placed anew. `floor` is added to the diagonal of every covariance.
+    """
+    stacked = np.concatenate(sequences)
+    n_states, size = gamma.shape[1], stacked.shape[1]
     # Steps without an observation carry the recursion on but say nothing about the emissions.
     seen = observed_rows(stacked)
     stacked, gamma = stacked[seen], gamma[seen]
@@ -87,26 +103,53 @@ def em_step(
         # Placed where the equal split in time would have put it, so that the order of states survives.
         fresh = equal_segments(sequences, n_states, 0.0)
         means[dead], covariances[dead] = fresh.emission_means[dead], fresh.emission_covariances[dead]
-    covariances += floor * np.eye(size)
-    transition = np.maximum(counts, 0.0) / np.maximum(counts.sum(1, keepdims=True), 1e-300)
-    transition = np.where(counts.sum(1, keepdims=True) > 0, transition, hmm.transition_matrix)
-    transition = np.maximum(transition, transition_floor)
-    initial = np.maximum(initial / len(sequences), transition_floor)
-    new = HMM(initial / initial.sum(), transition / transition.sum(1, keepdims=True), means, covariances)
-    return new, total
+    return means, covariances + floor * np.eye(size)
+
+
+def maximise_transitions(
+    counts: Float[np.ndarray, "S S"], previous: Float[np.ndarray, "S S"], floor: float = TRANSITION_FLOOR
+) -> Float[np.ndarray, "S S"]:
+    """The M-step of the transitions: probabilities from expected counts, a row that counts nothing as in `previous`."""
+    left = counts.sum(1, keepdims=True)
+    transition = np.where(left > 0, np.maximum(counts, 0.0) / np.maximum(left, 1e-300), previous)
+    transition = np.maximum(transition, floor)
+    return transition / transition.sum(1, keepdims=True)
+
+
+def em_step(
+    hmm: HMM,
+    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    floor: float,
+    transition_floor: float = TRANSITION_FLOOR,
+) -> tuple[HMM, float]:
+    """One iteration of EM. Returns the new model and the log-likelihood of the one that was given.
+
+    `floor` is added to the diagonal of every covariance (the paper's regularisation), once an iteration.
+    """
+    found = expectation(hmm, sequences)
+    means, covariances = maximise_emissions(sequences, found.gamma, floor)
+    transition = maximise_transitions(found.transitions, hmm.transition_matrix, transition_floor)
+    initial = np.maximum(found.initial / len(sequences), transition_floor)
+    return HMM(initial / initial.sum(), transition, means, covariances), found.log_likelihood
 
 
 def fit(
-    hmm: HMM, sequences: Sequence[Float[np.ndarray, "_ D"]], floor: float, n_iterations: int, tolerance: float = 1e-3
+    hmm: HMM,
+    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    floor: float,
+    n_iterations: int,
+    tolerance: float = 1e-3,
+    step: Callable[[Any, Sequence[np.ndarray], float], tuple[HMM, float]] = em_step,
 ) -> tuple[HMM, list[float]]:
     """EM from a start until the log-likelihood per step rises by less than `tolerance`, or `n_iterations`.
 
-    Returns the model and the log-likelihood before every iteration.
+    `step` is one iteration for the start's kind of model. Returns the model and the log-likelihood before every
+    iteration.
     """
     n_steps = sum(map(len, sequences))
     history: list[float] = []
     for _ in range(n_iterations):
-        hmm, total = em_step(hmm, sequences, floor)
+        hmm, total = step(hmm, sequences, floor)
         converged = bool(history) and abs(total - history[-1]) < tolerance * n_steps
         history.append(total)
         if converged:
