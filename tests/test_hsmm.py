@@ -188,7 +188,7 @@ def test_without_observations_a_state_lasts_its_duration() -> None:
     np.testing.assert_array_equal(active, np.repeat([0, 1, 2], [20, 30, 20]))
 
 
-@pytest.mark.parametrize("chunk", [1, 7])
+@pytest.mark.parametrize("chunk", [1, 2, 7])
 def test_a_stream_gives_what_the_whole_sequence_gives(chunk: int) -> None:
     rng = np.random.default_rng(6)
     hsmm = random_hsmm(rng, 4, 3).marginal(slice(0, 2))
