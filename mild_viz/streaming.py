@@ -14,7 +14,7 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, FilterCarry, continue_filter, log_emission
+from mild_viz.latent.hmm import HMM, FilterCarry, log_emission
 from mild_viz.latent.vae import VAE
 from mild_viz.pipeline import with_contact_states
 from mild_viz.robot.contact import in_frame
@@ -113,7 +113,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     mean, std = model.human_vae.encode(window)
-    log_alpha, filtered = continue_filter(model.human_hmm, log_emission(model.human_hmm, mean), seen.filter)
+    log_alpha, _, filtered = model.human_hmm.filter(log_emission(model.human_hmm, mean), seen.filter)
     latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
     decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
