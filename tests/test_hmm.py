@@ -15,7 +15,6 @@ from mild_viz.errors import UserError
 from mild_viz.latent.hmm import (
     HMM,
     check_hmm,
-    continue_filter,
     forward_filter,
     log_emission,
     unobserved_forward,
@@ -90,8 +89,8 @@ def test_filter_continues_from_the_previous_step(example: tuple[HMM, np.ndarray]
     hmm, z = example
     likelihood = log_emission(hmm, z)
     whole, _ = forward_filter(hmm, likelihood)
-    head, carry = continue_filter(hmm, likelihood[:3], None)
-    tail, _ = continue_filter(hmm, likelihood[3:], carry)
+    head, _, carry = hmm.filter(likelihood[:3])
+    tail, _, _ = hmm.filter(likelihood[3:], carry)
     np.testing.assert_allclose(np.concatenate([head, tail]), whole, atol=1e-12)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from mild_viz.errors import UserError
-from mild_viz.latent.hmm import HMM, continue_filter, forward_filter, log_emission, unobserved_forward
+from mild_viz.latent.hmm import HMM, forward_filter, log_emission, unobserved_forward
 from mild_viz.latent.hsmm import HSMM, check_hsmm
 from tests.models import TableHSMM, random_hmm, random_hsmm, without_returns
 
@@ -188,7 +188,7 @@ def test_without_observations_a_state_lasts_its_duration() -> None:
     np.testing.assert_array_equal(active, np.repeat([0, 1, 2], [20, 30, 20]))
 
 
-@pytest.mark.parametrize("chunk", [1, 7])
+@pytest.mark.parametrize("chunk", [1, 2, 7])
 def test_a_stream_gives_what_the_whole_sequence_gives(chunk: int) -> None:
     rng = np.random.default_rng(6)
     hsmm = random_hsmm(rng, 4, 3).marginal(slice(0, 2))
@@ -198,7 +198,7 @@ def test_a_stream_gives_what_the_whole_sequence_gives(chunk: int) -> None:
     whole, _ = forward_filter(hsmm, likelihood)
     carry, parts = None, []
     for start in range(0, len(z), chunk):
-        part, carry = continue_filter(hsmm, likelihood[start : start + chunk], carry)
+        part, _, carry = hsmm.filter(likelihood[start : start + chunk], carry)
         parts.append(part)
     np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-12)
 

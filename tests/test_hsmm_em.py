@@ -57,7 +57,7 @@ def test_durations_and_places_are_recovered() -> None:
     np.testing.assert_allclose(model.duration_means[:3], DURATIONS, atol=1.5)
     np.testing.assert_allclose(model.duration_stds[:3], SPREADS, rtol=0.3)
     np.testing.assert_allclose(model.emission_means, PLACES, atol=0.05)
-    assert model.transition_matrix[3, 3] > 0.999
+    assert model.transition_matrix[3, 3] > 0.999 and model.initial_probs[0] > 0.999
     whole = np.concatenate([np.repeat(range(4), [20, 45, 30, 25])])
     made = PLACES[whole] + 0.5 * np.random.default_rng(2).normal(size=(len(whole), 2))
     path, _ = model.viterbi(log_emission(model, made))

@@ -137,21 +137,13 @@ def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N 
 
 
 def forward_filter(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Float[np.ndarray, "N S"], float]:
-    """Normalised forward variable log alpha (Eq. hmm-h), and log p(z_{1:N}).
+    """Normalised forward variable log alpha (Eq. hmm-h), and log p(z_{1:N}), of a whole sequence.
 
     A row of zeros in `log_likelihood` is a step without an observation; all rows zero give the unobserved
     forward variable of Eq. vaeHMM-prior.
     """
     log_alpha, total, _ = hmm.filter(log_likelihood)
     return log_alpha, total
-
-
-def continue_filter(
-    hmm: HMM, log_likelihood: Float[np.ndarray, "N S"], carry: FilterCarry | None
-) -> tuple[Float[np.ndarray, "N S"], FilterCarry]:
-    """The same for a stream: log alpha of the next steps after those that left `carry`, and what they leave."""
-    log_alpha, _, carry = hmm.filter(log_likelihood, carry)
-    return log_alpha, carry
 
 
 def unobserved_forward(hmm: HMM, n_steps: int) -> Float[np.ndarray, "N S"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mild_viz.latent.context import ContextLayout, ContextRegression, condition_on_context
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, FilterCarry, continue_filter, log_emission, observed_rows
+from mild_viz.latent.hmm import HMM, FilterCarry, log_emission, observed_rows
 from mild_viz.latent.vae import VAE
 
 
@@ -79,7 +79,7 @@ class InteractionModel:
         """
         hmm, human_hmm = self.hmms[action], self.human_hmms[action]
         mean, std = self.human_vae.encode(human)
-        log_alpha, filtered = continue_filter(human_hmm, log_emission(human_hmm, mean), carry.filter)
+        log_alpha, _, filtered = human_hmm.filter(log_emission(human_hmm, mean), carry.filter)
         history = carry.history
         if action in self.regressions:
             filled = _fill_forward(mean, history)

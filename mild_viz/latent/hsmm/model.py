@@ -66,6 +66,7 @@ class HSMM(HMM):
     def filter(
         self, log_likelihood: Float[np.ndarray, "N S"], carry: FilterCarry | None = None
     ) -> tuple[Float[np.ndarray, "N S"], float, FilterCarry]:
+        """As for the HMM; what is carried on is over state and elapsed duration (S, longest)."""
         if carry is None:
             table = self.beginning()
         else:
@@ -76,6 +77,7 @@ class HSMM(HMM):
         return log_alpha, float(total), tables[(len(log_alpha) - 1) % 2]
 
     def smooth(self, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "N S"]:
+        """log p(state at n given z_{1:N}), by forward-backward."""
         return self.count(log_likelihood, np.zeros(self.transition_matrix.shape), np.zeros(self.log_durations.shape))[0]
 
     def count(
@@ -105,6 +107,7 @@ class HSMM(HMM):
         return log_gamma, float(total)
 
     def viterbi(self, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
+        """States of the most likely segments, and the segments' joint log probability with the observations."""
         path = np.empty(len(log_likelihood), dtype=np.int64)
         score = kernels.viterbi(self.beginning(), *self.chain, np.ascontiguousarray(log_likelihood), path)
         return path, float(score)
