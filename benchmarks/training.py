@@ -46,7 +46,7 @@ PUBLISHED_EPOCHS = 400
 Result = TypeVar("Result")
 
 
-def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 2, rounds: int = 2, full: bool = False) -> None:
+def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 5, rounds: int = 2, full: bool = False) -> None:
     """Print what an epoch of a variant and seed takes either way, and the ratio.
 
     Args:

@@ -224,3 +224,43 @@ def viterbi(log_prior, log_transition, log_likelihood, path):
     for n in range(n_steps - 1, 0, -1):
         path[n - 1] = origin[n, path[n]]
     return score.max()
+
+
+@njit(cache=True)
+def condition_states(human_mean, human_variance, means, covariances, conditional_mean, conditional_covariance):
+    """Fill the conditional mean (N, S, R) and covariance (N, S, R, R) of every state for each human posterior (N, H).
+
+    With L the Cholesky factor of the innovation Sigma^hh_i + diag(variance_n), Y = L^-1 Sigma^hr_i and
+    w = L^-1 (mean_n - mu^h_i), the mean is mu^r_i + Y^T w and the covariance Sigma^rr_i - Y^T Y.
+    """
+    n_steps, size = human_mean.shape
+    width = means.shape[1] - size + 1
+    factor, solved = np.empty((size, size)), np.empty((size, width))
+    for n in range(n_steps):
+        for i in range(len(means)):
+            mean, covariance = means[i], covariances[i]
+            for a in range(size):
+                for b in range(a):
+                    value = covariance[a, b]
+                    for c in range(b):
+                        value -= factor[a, c] * factor[b, c]
+                    factor[a, b] = value * factor[b, b]
+                value = covariance[a, a] + human_variance[n, a]
+                for c in range(a):
+                    value -= factor[a, c] * factor[a, c]
+                factor[a, a] = 1.0 / np.sqrt(value)  # the inverse, for it is only divided by
+                for r in range(width):  # the columns of Y, then w
+                    value = covariance[a, size + r] if r < width - 1 else human_mean[n, a] - mean[a]
+                    for c in range(a):
+                        value -= factor[a, c] * solved[c, r]
+                    solved[a, r] = value * factor[a, a]
+            for r in range(width - 1):
+                value = mean[size + r]
+                for c in range(size):
+                    value += solved[c, r] * solved[c, width - 1]
+                conditional_mean[n, i, r] = value
+                for q in range(r + 1):
+                    value = covariance[size + r, size + q]
+                    for c in range(size):
+                        value -= solved[c, r] * solved[c, q]
+                    conditional_covariance[n, i, r, q] = conditional_covariance[n, i, q, r] = value
