@@ -26,7 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 import tyro
-from naive_training import NaiveHMM, NaiveHuman, NaiveRobot, TrialWindows
+from naive_training import SAMPLES, NaiveHMM, NaiveHuman, NaiveRobot, TrialWindows
 
 from mild_viz.data.load import load_dataset
 from mild_viz.latent.em import equal_segments, fit
@@ -44,6 +44,8 @@ PUBLISHED_ERROR = 0.042
 PUBLISHED_EPOCHS = 400
 
 Result = TypeVar("Result")
+Units = tuple[torch.Tensor, torch.Tensor]
+"""What is subtracted from a window, and what it is divided by."""
 
 
 def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 5, rounds: int = 2, full: bool = False) -> None:
@@ -62,13 +64,24 @@ def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 5, rounds: int = 
     )
     trials = load_dataset(dataset).train
     human_data, robot_data = (stack_windows(trials, names) for names in (None, ROBOTS[ROBOT].joint_names))
-    human_trials, robot_trials = trial_windows(human_data), trial_windows(robot_data)
+    people, usable = complete_rows(human_data), complete_rows(robot_data)
+    human_units, robot_units = (
+        standardisation(np.concatenate([people.human, people.partner])),
+        standardisation(usable.partner),
+    )
+    human_trials = trial_windows(human_data, human_units, human_units)
+    robot_trials = trial_windows(robot_data, human_units, robot_units)
     check_same_numbers(human_trials, human_data, options)
 
     units = epochs * np.array([seeds, seeds, seeds * len(VARIANTS), seeds * len(VARIANTS)])
     print(
         f"{dataset}: {len(trials)} trials, {len(human_data.trial)} windows; {len(VARIANTS)} variants, {seeds} seeds, "
-        f"{epochs} epochs of each stage, at most {options.em_iterations} iterations of EM an epoch and interaction\n"
+        f"{epochs} epochs of each stage\n"
+        f"alike: networks, losses, seeds, epochs, EM from the equal split after every epoch (at most "
+        f"{options.em_iterations} iterations; checked to give the same numbers)\n"
+        f"unlike, as the two ways are: theirs {SAMPLES} samples, batches of a trial, a network for each variant and "
+        f"seed, the conditional anew in every epoch;\n  ours 1 sample and the mean, batches of {options.batch_size} "
+        "windows, all networks at once, the conditional once (counted)\n"
         "CPU seconds: the human stage by epoch and seed; the robot stage and both by epoch, variant and seed"
     )
     print(f"{'turn':5} {'way':13} {'human':>9} {'without EM':>11} {'robot':>9} {'both':>9}")
@@ -140,22 +153,16 @@ def whole_protocol(dataset: str, seeds: int, authors_hours: float) -> None:
     )
 
 
-def trial_windows(data: Windows) -> list[TrialWindows]:
-    """The complete windows of every trial in the units that our networks train in."""
+def trial_windows(data: Windows, human_units: Units, partner_units: Units) -> list[TrialWindows]:
+    """The complete windows of every trial, standardised."""
     usable = complete_rows(data)
-    both = np.concatenate([usable.human, usable.partner]) if data.human.shape == data.partner.shape else None
-    result = []
-    for trial, action in enumerate(data.actions):
-        rows = usable.rows(trial)
-        human, partner = (
-            (torch.tensor(x[rows], dtype=torch.float32) - offset) / scale
-            for x, (offset, scale) in (
-                (usable.human, standardisation(usable.human if both is None else both)),
-                (usable.partner, standardisation(usable.partner if both is None else both)),
-            )
-        )
-        result.append(TrialWindows(action, human, partner, torch.tensor(usable.step[rows])))
-    return result
+    human, partner = (
+        (torch.tensor(x, dtype=torch.float32) - offset) / scale
+        for x, (offset, scale) in ((usable.human, human_units), (usable.partner, partner_units))
+    )
+    rows = [usable.rows(trial) for trial in range(len(data.actions))]
+    step = torch.tensor(usable.step)
+    return [TrialWindows(action, human[r], partner[r], step[r]) for action, r in zip(data.actions, rows, strict=True)]
 
 
 def check_same_numbers(trials: Sequence[TrialWindows], data: Windows, options: TrainingOptions) -> None:
