@@ -16,6 +16,7 @@ from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
 from mild_viz.errors import UserError
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
+from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import robot_truth
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
@@ -53,6 +54,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
     human_hmm = hmm.marginal(human)
     human_likelihood = log_emission(human_hmm, mean)
     log_alpha, _ = forward_filter(human_hmm, human_likelihood)
+    transition = checkpoint.transition_states.get(trial.action)
     both = np.concatenate([mean, latent_truth], axis=1)
     # Where the partner was lost, the human alone still says something.
     joint_likelihood = np.where(observed_rows(both)[:, None], log_emission(hmm, both), human_likelihood)
@@ -78,6 +80,9 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         log_alpha_joint=log_alpha_joint,
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),
         active_state=log_alpha.argmax(1),
+        log_transition=transition.log_probability(mean, human_likelihood, log_alpha)
+        if transition is not None
+        else np.full(n_windows, -np.inf),
         human_latent_mean=mean,
         human_latent_covariance=(std**2)[:, :, None] * np.eye(size),
         robot_latent_mean=robot_mean,
@@ -102,6 +107,7 @@ def control(
 ) -> Rollout:
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
     settings = with_contact_states(settings, checkpoint, inference.action)
+    transition = checkpoint.transition_states.get(inference.action)
     placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
     target = in_frame(placed.T_world_human, inference.human_hand)
     result = run_controller(
@@ -112,6 +118,7 @@ def control(
         inference.joints_decoded,
         target,
         initial_carry(robot.chain),
+        inference.log_transition if uses_transition(settings, transition) else None,
     )
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
@@ -145,6 +152,11 @@ def with_contact_states(settings: ControlSettings, checkpoint: Checkpoint, actio
     if bad:
         raise UserError(f"contact states {bad} do not exist; valid: 0 to {checkpoint.n_states - 1}")
     return settings
+
+
+def uses_transition(settings: ControlSettings, transition: TransitionState | None) -> bool:
+    """Whether a controller uses a transition state: only if it leads to the contact states that are chosen."""
+    return transition is not None and transition.contact_states == settings.contact_states
 
 
 def state_visits(

@@ -15,8 +15,9 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import HMM, forward_filter, log_emission
+from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
-from mild_viz.pipeline import with_contact_states
+from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
@@ -31,6 +32,7 @@ class StreamModel:
     robot_vae: VAE
     hmm: HMM
     human_hmm: HMM
+    transition: TransitionState | None
     posterior_covariance: bool
     action: str
     robot: RobotModel
@@ -60,6 +62,7 @@ class Command(NamedTuple):
     """The answer to one observation; `None` fields until the first window is full."""
 
     log_alpha: Float[np.ndarray, " S"]
+    log_transition: float
     active_state: int
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
@@ -86,6 +89,7 @@ def stream_model(
         robot_vae=checkpoint.robot_vae(variant),
         hmm=hmm,
         human_hmm=hmm.marginal(slice(0, checkpoint.human_vae.latent_size)),
+        transition=checkpoint.transition_states.get(action),
         posterior_covariance=VARIANTS[variant].posterior_covariance,
         action=action,
         robot=robot,
@@ -113,14 +117,28 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     mean, std = model.human_vae.encode(window)
-    log_alpha, _ = forward_filter(model.human_hmm, log_emission(model.human_hmm, mean), seen.log_alpha)
+    likelihood = log_emission(model.human_hmm, mean)
+    log_alpha, _ = forward_filter(model.human_hmm, likelihood, seen.log_alpha)
+    log_transition = np.full(1, -np.inf)
+    if model.transition is not None:
+        log_transition = model.transition.log_probability(mean, likelihood, log_alpha)
     latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
     decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     target = in_frame(model.T_world_human, hand[None])
-    result = run_controller(model.robot.chain, model.settings, model.action, log_alpha, decoded, target, seen.control)
+    result = run_controller(
+        model.robot.chain,
+        model.settings,
+        model.action,
+        log_alpha,
+        decoded,
+        target,
+        seen.control,
+        log_transition if uses_transition(model.settings, model.transition) else None,
+    )
     command = Command(
         log_alpha=log_alpha[0],
+        log_transition=float(log_transition[0]),
         active_state=int(log_alpha[0].argmax()),
         robot_latent_mean=latent_mean[0],
         robot_latent_covariance=latent_covariance[0],

@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from mild_viz.checkpoint.model import Checkpoint, RobotInterface
 from mild_viz.errors import UserError
@@ -20,6 +20,13 @@ MAX_SIZE = 100_000
 
 Kind = TypeVar("Kind")
 KINDS: dict[type, str] = {str: "a text", bool: "true or false", list: "a list [...]", dict: "an object {...}"}
+
+
+class TransitionScalars(NamedTuple):
+    """What a `TransitionState` has besides its Gaussian."""
+
+    hazard: float
+    contact_states: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,7 @@ class Config:
     robot: RobotInterface | None
     variants: tuple[str, ...]
     contact_states: dict[str, frozenset[int]]
+    transition_states: dict[str, TransitionScalars]
     placement: Placement | None
     training: dict[str, Any]
     metrics: dict[str, Any]
@@ -55,6 +63,10 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
         "variants": {name: asdict(VARIANTS[name]) for name in checkpoint.variants},
         "contact_states": {action: sorted(states) for action, states in checkpoint.contact_states.items()},
+        "transition_states": {
+            action: {"hazard": state.hazard, "contact_states": sorted(state.contact_states)}
+            for action, state in checkpoint.transition_states.items()
+        },
         "placement": asdict(checkpoint.placement) if checkpoint.placement else None,
         "training": dict(checkpoint.training),
         "metrics": dict(checkpoint.metrics),
@@ -120,6 +132,19 @@ def parse_contact_states(value: Any, actions: Sequence[str], n_states: int, wher
         result[action] = frozenset(states)
         check_states(result[action], action, actions, n_states, where)
     return result
+
+
+def _transition_states(value: Any, actions: Sequence[str], n_states: int, where: str) -> dict[str, TransitionScalars]:
+    """A table of action: {hazard, contact_states}. Whether the hazard is a probability is checked with the tensors."""
+    for action, row in _typed(value, dict, where).items():
+        choose(f"{where}: action", action, list(actions))
+        _need(_typed(row, dict, f"{where}.{action}"), TransitionScalars._fields, f"{where}.{action}")
+    leads_to = {action: row["contact_states"] for action, row in value.items()}
+    states = parse_contact_states(leads_to, actions, n_states, where)
+    return {
+        action: TransitionScalars(_number(row["hazard"], f"{where}.{action}.hazard"), states[action])
+        for action, row in value.items()
+    }
 
 
 def _robot(value: Any, where: str) -> RobotInterface | None:
@@ -201,6 +226,9 @@ def read_config(file: Path) -> Config:
         robot=robot,
         variants=_variants(config["variants"], robot, f"{file}: variants"),
         contact_states=contact,
+        transition_states=_transition_states(
+            config.get("transition_states", {}), actions, n_states, f"{file}: transition_states"
+        ),
         placement=_placement(config.get("placement"), f"{file}: placement"),
         training=_typed(config.get("training", {}), dict, f"{file}: training"),
         metrics=_typed(config.get("metrics", {}), dict, f"{file}: metrics"),

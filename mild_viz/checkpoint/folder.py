@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save_file
 
 from mild_viz.checkpoint.config import (
     SCHEMA_VERSION,
+    TransitionScalars,
     check_states,
     config_of,
     is_config,
@@ -27,6 +28,7 @@ from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.files import write_atomically
 from mild_viz.latent.hmm import HMM, check_hmm
+from mild_viz.latent.transition import TransitionState, check_transition_state
 from mild_viz.latent.vae import make_vae
 from mild_viz.settings import HUMAN_FEATURES, WINDOW
 
@@ -39,6 +41,8 @@ def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     for action, hmm in checkpoint.hmms.items():
         for name in HMM.__dataclass_fields__:
             tensors[f"hmm/{action}/{name}"] = getattr(hmm, name)
+    for action, state in checkpoint.transition_states.items():
+        tensors |= {f"transition/{action}/{name}": getattr(state, name) for name in ("mean", "covariance")}
     for variant, vae in checkpoint.robot_vaes.items():
         tensors |= {f"robot/{variant}/{name}": value for name, value in vae.weights.items()}
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}
@@ -121,15 +125,29 @@ def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, n_states: int, siz
         "initial_probs": (n_states,), "transition_matrix": (n_states, n_states),
         "emission_means": (n_states, size), "emission_covariances": (n_states, size, size),
     }  # fmt: skip
+    return check_hmm(HMM(**_shaped(tensors, f"hmm/{action}", shapes, where)), f"{where}: hmm/{action}")
+
+
+def _read_transition(
+    tensors: Mapping[str, np.ndarray], action: str, scalars: TransitionScalars, size: int, where: str
+) -> TransitionState:
+    gaussian = _shaped(tensors, f"transition/{action}", {"mean": (size,), "covariance": (size, size)}, where)
+    return check_transition_state(TransitionState(**gaussian, **scalars._asdict()), f"{where}: transition/{action}")
+
+
+def _shaped(
+    tensors: Mapping[str, np.ndarray], prefix: str, shapes: Mapping[str, tuple[int, ...]], where: str
+) -> dict[str, np.ndarray]:
+    """The tensors of `shapes` under a prefix; an error names one that is missing or has another shape."""
     values = {}
     for name, shape in shapes.items():
-        key = f"hmm/{action}/{name}"
+        key = f"{prefix}/{name}"
         if key not in tensors:
             raise UserError(f"{where}: tensor '{key}' is missing")
         if tensors[key].shape != shape:
             raise UserError(f"{where}: tensor '{key}' has shape {tensors[key].shape}, expected {shape}")
         values[name] = tensors[key].astype(np.float64)
-    return check_hmm(HMM(**values), f"{where}: hmm/{action}")
+    return values
 
 
 def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -174,6 +192,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
         },
         robot=robot,
         contact_states=config.contact_states,
+        transition_states={
+            action: _read_transition(tensors, action, scalars, latent, str(file))
+            for action, scalars in config.transition_states.items()
+        },
         placement=config.placement,
         hidden=hidden,
         training=config.training,

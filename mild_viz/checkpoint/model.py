@@ -9,6 +9,7 @@ from typing import Any
 
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM
+from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
 from mild_viz.settings import Placement, choose
 
@@ -37,6 +38,8 @@ class Checkpoint:
     """None for a human-human model: the partner is then the second human."""
     contact_states: Mapping[str, frozenset[int]] = field(default_factory=dict)
     """States in which the partners touch, by action."""
+    transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
+    """Where reaching turns into contact, by action; an action without one is controlled by the HMM's states alone."""
     placement: Placement | None = None
     hidden: tuple[int, int] = (40, 20)
     training: Mapping[str, Any] = field(default_factory=dict)

@@ -29,6 +29,7 @@ from mild_viz.training.human_stage import complete_rows, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
+from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Dataset, Trial
 
 ROBOT = "pepper"
@@ -125,9 +126,14 @@ def train(
     metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
+        contact = contact_states(chosen, fit)
         chosen = replace(
             chosen,
-            contact_states=contact_states(chosen, fit),
+            contact_states=contact,
+            # the HMMs were fitted to the human VAE's latents of both people
+            transition_states=learn_transition_states(
+                chosen.human_vae, chosen.human_vae, chosen.hmms, contact, human_data
+            ),
             placement=contact_placement(source.train),
         )
     saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
