@@ -64,6 +64,8 @@ def check_transition_state(state: TransitionState, where: str) -> TransitionStat
     """Return `state` if it is valid, else raise an error that says what is wrong."""
     if not 0.0 < state.hazard < 1.0:
         raise UserError(f"{where}: hazard is {state.hazard}; valid: a number between 0 and 1, both excluded")
+    if not state.contact_states:
+        raise UserError(f"{where}: no contact states; expected one or more of the model's states")
     check_hmm(state._emission, where)
     return state
 

@@ -17,6 +17,7 @@ from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_tar
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.pipeline import NEWEST, infer
@@ -127,13 +128,12 @@ def train(
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
         contact = contact_states(chosen, fit)
+        # the HMMs were fitted to the human VAE's latents of both people
+        fitted = InteractionModel(chosen.human_vae, chosen.hmms, chosen.human_vae)
         chosen = replace(
             chosen,
             contact_states=contact,
-            # the HMMs were fitted to the human VAE's latents of both people
-            transition_states=learn_transition_states(
-                chosen.human_vae, chosen.human_vae, chosen.hmms, contact, human_data
-            ),
+            transition_states=learn_transition_states(fitted, contact, human_data),
             placement=contact_placement(source.train),
         )
     saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
