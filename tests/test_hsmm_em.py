@@ -95,7 +95,9 @@ def test_a_state_that_does_not_occur_gets_the_equal_splits_duration(data: list[n
 
 
 def test_a_state_whose_end_is_never_seen_lasts_no_longer_than_a_sequence(data: list[np.ndarray]) -> None:
-    model, _ = fit(equal_segments([s[:40] for s in data], 2, 1e-2), [s[:15] for s in data], 1e-2, 60, -1.0, em_step)
+    model, _ = fit(
+        equal_segments([s[:40] for s in data], 2, 1e-2), [s[:15] for s in data], 1e-2, 60, -1.0, step=em_step
+    )
     assert isinstance(model, HSMM)
     assert (model.duration_means <= 15.0).all() and (model.duration_stds <= 15.0).all()
 

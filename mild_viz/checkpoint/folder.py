@@ -142,6 +142,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         rate=config.rate,
         contact_states=config.contact_states,
         own_contact_states=config.own_contact_states,
+        transition_states=parts.transition_states,
         placement=config.placement,
         hidden=config.hidden,
         training=config.training,

@@ -17,6 +17,7 @@ from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_tar
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.pipeline import NEWEST, infer
@@ -29,6 +30,7 @@ from mild_viz.training.human_stage import complete_rows, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
+from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Dataset, Trial
 
 ROBOT = "pepper"
@@ -127,9 +129,13 @@ def train(
     metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
+        contact = contact_states(chosen, fit)
+        # the HMMs were fitted to the human VAE's latents of both people
+        fitted = InteractionModel(chosen.human_vae, chosen.hmms, chosen.human_vae)
         chosen = replace(
             chosen,
-            contact_states=contact_states(chosen, fit),
+            contact_states=contact,
+            transition_states=learn_transition_states(fitted, contact, human_data),
             placement=contact_placement(source.train),
         )
     saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
