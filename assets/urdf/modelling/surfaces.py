@@ -222,23 +222,40 @@ def ellipsoid(radii: Sequence[float], colour: Colour, size: tuple[int, int] = (1
     return grid(np.stack(np.broadcast_arrays(x, y, soft(np.sin(latitude))), -1) * np.asarray(radii), colour)
 
 
-def tube(path: Array, radii: Array, colour: Colour, columns: int = 14) -> Piece:
-    """A round tube along points (K, 3) with radii (K,), closed by half spheres."""
+def tube(path: Array, radii: Array, colour: Colour, columns: int = 14, edge: float | None = None) -> Piece:
+    """A round tube along points (K, 3) with radii (K,), closed by half spheres, or flat with rounded edges."""
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     across = np.cross(tangents[0], (0.0, 0.0, 1.0) if abs(tangents[0][2]) < 0.9 else (0.0, 1.0, 0.0))
     angle = np.arange(columns) * 2 * np.pi / columns
-    dome = np.linspace(0, np.pi / 2, 5)
     rings = []
     for k, (point, tangent, radius) in enumerate(zip(path, tangents, radii, strict=True)):
         across = across - tangent * (across @ tangent)  # carried along the path, so that the tube does not twist
         across /= np.linalg.norm(across)
         circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(tangent, across)
-        ends = {0: -dome[:0:-1], len(path) - 1: dome}.get(k, np.zeros(1))
-        if k == 0:
-            ends = np.append(ends, 0.0)
-        rings += [point + radius * (np.cos(e) * circle * (abs(e) < 1.57) + np.sin(e) * tangent) for e in ends]
+        around, along = np.array([radius]), np.zeros(1)
+        if k == len(path) - 1:
+            around, along = end_profile(radius, edge)
+        elif k == 0:
+            around, along = (profile[::-1] for profile in end_profile(radius, edge))
+            along = -along
+        rings += [point + wide * circle + far * tangent for wide, far in zip(around, along, strict=True)]
     return grid(np.stack(rings), colour)
+
+
+def end_profile(radius: float, edge: float | None) -> tuple[Array, Array]:
+    """Radii and distances beyond the last point of the rings that close a tube."""
+    dome = np.linspace(0, np.pi / 2, 5)
+    if edge is None:
+        return radius * np.cos(dome) * (dome < 1.57), radius * np.sin(dome)
+    around, along = radius - edge * (1 - np.cos(dome)), edge * (np.sin(dome) - 1)
+    return np.append(around, [0.85 * around[-1], 0.0]), np.append(along, [0.0, 0.0])
+
+
+def limb(keys: Sequence[Sequence[float]], colour: Colour, rows: int = 14, columns: int = 30, edge: float = 0.006) -> Piece:
+    """A tube along a spline with control points (x, y, z, radius), its ends flat with rounded edges."""
+    points = spline(keys)(np.linspace(0, 1, rows))
+    return tube(points[:, :3], points[:, 3], colour, columns, edge)
 
 
 def slab(
