@@ -252,7 +252,9 @@ def end_profile(radius: float, edge: float | None) -> tuple[Array, Array]:
     return np.append(around, [0.85 * around[-1], 0.0]), np.append(along, [0.0, 0.0])
 
 
-def limb(keys: Sequence[Sequence[float]], colour: Colour, rows: int = 14, columns: int = 30, edge: float = 0.006) -> Piece:
+def limb(
+    keys: Sequence[Sequence[float]], colour: Colour, rows: int = 14, columns: int = 30, edge: float = 0.006
+) -> Piece:
     """A tube along a spline with control points (x, y, z, radius), its ends flat with rounded edges."""
     points = spline(keys)(np.linspace(0, 1, rows))
     return tube(points[:, :3], points[:, 3], colour, columns, edge)

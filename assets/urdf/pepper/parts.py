@@ -10,8 +10,21 @@ from collections.abc import Callable
 
 import numpy as np
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, SCREEN, WHITE
+from modelling.surfaces import (
+    Y_AXIS,
+    Array,
+    Colour,
+    LobedLoft,
+    Loft,
+    Piece,
+    body,
+    disc_decal,
+    ellipsoid,
+    revolve,
+    shell,
+    slab,
+)
 from scipy.interpolate import PchipInterpolator
-from modelling.surfaces import Y_AXIS, Array, Colour, LobedLoft, Loft, Piece, body, disc_decal, ellipsoid, revolve, shell, slab
 
 PI = np.pi
 

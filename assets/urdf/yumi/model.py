@@ -62,7 +62,7 @@ def turned_to(direction: str) -> Array:
 
 
 def drum(low: float, high: float, radius: float) -> list[Piece]:
-    """A joint's housing along z with a soft dome at the far end, and its dark joint at the near one (z = 0 or above)."""
+    """A joint's housing along z with a soft dome at the far end and a dark joint at the near one."""
     near, far = (low, high) if abs(low) < abs(high) else (high, low)
     way = 1.0 if far > near else -1.0
     profile = [(0.0, near + way * 0.003), (radius - 0.002, near + way * 0.003), (radius, near + way * 0.006)]
@@ -80,12 +80,13 @@ def trunk() -> list[Piece]:
     foot = Loft(
         [
             (-0.100, -0.17, 0.0, 0.0, 0.0, 3.5),
-            (-0.100, -0.17, 0.250, 0.180, 0.190, 3.5),
-            (-0.080, -0.17, 0.265, 0.187, 0.198, 3.5),
-            (-0.035, -0.17, 0.265, 0.188, 0.198, 3.5),
-            (0.000, -0.17, 0.235, 0.188, 0.196, 3.2),
-            (0.030, -0.17, 0.130, 0.187, 0.185, 3.0),
-            (0.080, -0.19, 0.095, 0.165, 0.140, 2.8),
+            (-0.100, -0.17, 0.255, 0.180, 0.190, 3.5),
+            (-0.085, -0.17, 0.268, 0.187, 0.199, 3.5),
+            (-0.030, -0.17, 0.268, 0.188, 0.199, 3.5),
+            (-0.005, -0.17, 0.262, 0.188, 0.198, 3.2),
+            (0.010, -0.17, 0.190, 0.187, 0.190, 3.0),
+            (0.035, -0.18, 0.110, 0.178, 0.160, 2.8),
+            (0.080, -0.21, 0.085, 0.148, 0.122, 2.8),
             (0.130, -0.22, 0.080, 0.135, 0.108, 2.8),
             (0.130, -0.22, 0.0, 0.0, 0.0, 2.8),
         ]
@@ -110,7 +111,15 @@ def mounts() -> list[Piece]:
     for origin, angles in ARMS.values():
         roll, pitch, yaw = (float(value) for value in angles)
         turn = about_z(yaw) @ about_y(pitch) @ about_x(roll)
-        ring = [(0.0, -0.075), (0.052, -0.075), (0.062, -0.050), (0.066, -0.020), (0.066, -0.006), (0.062, -0.002), (0.0, -0.002)]
+        ring = [
+            (0.0, -0.075),
+            (0.052, -0.075),
+            (0.062, -0.050),
+            (0.066, -0.020),
+            (0.066, -0.006),
+            (0.062, -0.002),
+            (0.0, -0.002),
+        ]
         pieces.append(revolve(ring, LIGHT, 34).moved(turn, [float(value) for value in origin]))
     return pieces
 
@@ -142,9 +151,10 @@ def first() -> list[Piece]:
 
 def second() -> list[Piece]:
     """Link 2: the upper arm, from joint 2 to joint 7."""
-    keys = [(0, 0, -0.050, 0.044), (0, 0.005, -0.036, 0.046), (-0.012, 0.045, -0.024, 0.047), (-0.028, 0.090, -0.002, 0.047),
+    keys = [(0, 0, -0.050, 0.044), (0, 0.005, -0.036, 0.046), (-0.012, 0.045, -0.024, 0.047), (-0.028, 0.090, -0.002,
+            0.047),
             (-0.030, 0.130, 0, 0.051), (-0.030, 0.169, 0, 0.052)]  # fmt: skip
-    return [limb(keys, WHITE), *drum(-0.078, 0.0, 0.048), joint_core(0.042)]
+    return [limb(keys, LIGHT), *drum(-0.078, 0.0, 0.048), joint_core(0.042)]
 
 
 def third() -> list[Piece]:
@@ -157,14 +167,16 @@ def third() -> list[Piece]:
 
 def fourth() -> list[Piece]:
     """Link 4: the lower arm, from joint 3 to joint 4."""
-    keys = [(0, 0, -0.050, 0.042), (0.002, 0.005, -0.036, 0.043), (0.018, 0.045, -0.022, 0.042), (0.038, 0.090, 0, 0.042),
+    keys = [(0, 0, -0.050, 0.042), (0.002, 0.005, -0.036, 0.043), (0.018, 0.045, -0.022, 0.042), (0.038, 0.090, 0,
+            0.042),
             (0.0405, 0.125, 0, 0.044), (0.0405, 0.161, 0, 0.042)]  # fmt: skip
-    return [limb(keys, WHITE), *drum(-0.078, 0.0, 0.047), joint_core(0.041)]
+    return [limb(keys, LIGHT), *drum(-0.078, 0.0, 0.047), joint_core(0.041)]
 
 
 def fifth() -> list[Piece]:
     """Link 5: from joint 4 into the housing of joint 5."""
-    keys = [(0, 0, 0.003, 0.040), (0, -0.004, 0.022, 0.036), (-0.008, -0.024, 0.050, 0.032), (-0.020, -0.040, 0.080, 0.031),
+    keys = [(0, 0, 0.003, 0.040), (0, -0.004, 0.022, 0.036), (-0.008, -0.024, 0.050, 0.032), (-0.020, -0.040, 0.080,
+            0.031),
             (-0.027, -0.046, 0.100, 0.031)]  # fmt: skip
     housing = [piece.moved(turned_to("-y"), (-0.027, 0.0, 0.10039)) for piece in drum(0.027, 0.070, 0.033)]
     return [limb(keys, WHITE), *housing, collar(0.037)]
@@ -172,7 +184,8 @@ def fifth() -> list[Piece]:
 
 def sixth() -> list[Piece]:
     """Link 6: the wrist, from joint 5 to joint 6."""
-    keys = [(0, 0, -0.032, 0.030), (0.004, -0.012, -0.022, 0.031), (0.020, -0.022, -0.006, 0.032), (0.027, -0.012, 0, 0.032),
+    keys = [(0, 0, -0.032, 0.030), (0.004, -0.012, -0.022, 0.031), (0.020, -0.022, -0.006, 0.032), (0.027, -0.012, 0,
+            0.032),
             (0.027, 0.020, 0, 0.032)]  # fmt: skip
     return [limb(keys, WHITE), *drum(-0.066, -0.026, 0.032), *drum(0.0, 0.027, 0.031), joint_core(0.028, 0.026)]
 
@@ -184,7 +197,11 @@ def joint_core(radius: float, half: float = 0.010) -> Piece:
 
 def seventh() -> list[Piece]:
     """Link 7: the flange."""
-    return [revolve([(0.0, -0.009), (0.027, -0.009), (0.030, -0.006), (0.030, 0.005), (0.028, 0.0075), (0.0, 0.0075)], DARK, 28)]
+    return [
+        revolve(
+            [(0.0, -0.009), (0.027, -0.009), (0.030, -0.006), (0.030, 0.005), (0.028, 0.0075), (0.0, 0.0075)], DARK, 28
+        )
+    ]
 
 
 def gripper() -> list[Piece]:
@@ -211,7 +228,7 @@ def finger() -> list[Piece]:
     foot = slab(0.020, 0.009, [(0.001, 0.0), (0.0, 0.001), (0.0, 0.016), (0.002, 0.018)], 0.002, GREY, 3)
     tip = tube(np.array([(-0.0058, 0.0065, 0.012), (-0.0055, 0.0065, 0.030), (-0.0047, 0.0065, 0.049)]),
                np.array([0.0056, 0.0052, 0.0042]), GREY, 14, 0.001)  # fmt: skip
-    return [foot.moved(shift=(-0.0055, 0.006, 0.0)), Piece(tip.vertices * (1.0, 1.0, 1.0), tip.faces, tip.colour)]
+    return [foot.moved(shift=(-0.0055, 0.006, 0.0)), tip]
 
 
 def links() -> dict[str, list[Piece]]:
