@@ -44,7 +44,7 @@ Pepper's end effector lies on the wrist's axis, so that none of them moves it.
 PANDA_JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 """The arm of the Panda from its base to its flange."""
 
-PANDA_FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+PANDA_FINGERS: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
 PANDA_REST = {
     "panda_joint2": -0.785398,
     "panda_joint4": -2.356194,

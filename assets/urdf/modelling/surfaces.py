@@ -209,6 +209,23 @@ def revolve(profile: Sequence[Sequence[float]], colour: Colour, columns: int = 4
     return grid(np.stack([x, y, np.repeat(points[:, 1:], columns, axis=1)], axis=-1), colour)
 
 
+def lathe(profile: Sequence[Sequence[float]], colour: Colour, columns: int = 26, edge: float = 0.003) -> Piece:
+    """A profile (radius, z) turned about z, its corners rounded over `edge` to either side."""
+    points = np.asarray(profile, float)
+    rounded = [points[0]]
+    for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
+        back, on = before - corner, after - corner
+        near = corner + back * min(edge / np.linalg.norm(back), 0.45)
+        far = corner + on * min(edge / np.linalg.norm(on), 0.45)
+        rounded += [near, (near + 2 * corner + far) / 4, far]
+    return revolve([*rounded, points[-1]], colour, columns)
+
+
+def band(radius: float, low: float, high: float, colour: Colour, columns: int = 28) -> Piece:
+    """The outside of a cylinder about z: a ring whose ends are hidden in other pieces."""
+    return revolve([(radius, low), (radius, high)], colour, columns)
+
+
 def ellipsoid(radii: Sequence[float], colour: Colour, size: tuple[int, int] = (18, 28), power: float = 2.0) -> Piece:
     """A superellipsoid about the origin: power 2 is an ellipsoid, larger ones are boxier."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, size[0])[:, None]
@@ -285,6 +302,14 @@ def slab(
         rings.append(np.column_stack([flat, np.full(len(flat), z)]))
     lower, upper = rings[0] * (0, 0, 1), rings[-1] * (0, 0, 1)
     return grid(np.stack([lower, *rings, upper]), colour)
+
+
+def rim(low: float, high: float, edge: float, steps: int = 4) -> list[tuple[float, float]]:
+    """Rows of a slab between two heights, its edges rounded."""
+    turn = np.linspace(0, np.pi / 2, steps)
+    inset, rise = edge * (1 - np.sin(turn)), edge * (1 - np.cos(turn))
+    lower = list(zip(inset.tolist(), (low + rise).tolist(), strict=True))
+    return lower + [(back, low + high - z) for back, z in reversed(lower)]
 
 
 def weld(piece: Piece) -> Piece:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from modelling.description import ZERO, Joint, Y, Z
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, WHITE
-from modelling.surfaces import Y_AXIS, Colour, Loft, Piece, body, limb, revolve, slab
+from modelling.surfaces import Y_AXIS, Colour, Loft, Piece, band, body, lathe, limb, rim, slab
 
 ROOT = "world"
 SHARED: dict[str, str] = {}
@@ -53,16 +53,14 @@ def elbow(keys: list[tuple[float, float, float, float]], colour: Colour = WHITE)
 
 def barrel(length: float, radius: float, cap: float, colour: Colour = WHITE) -> list[Piece]:
     """A joint's housing along z, from its groove at z = 0 to its cap at z = length."""
-    shell = [(0.0, GAP), (radius - 0.003, GAP), (radius, GAP + 0.003), (radius, length - 0.008),
-             (radius - 0.003, length - 0.002), (cap, length), (0.0, length)]  # fmt: skip
-    lid = [(0.0, length - 0.001), (cap - 0.006, length - 0.001), (cap - 0.006, length + 0.0012),
-           (cap - 0.009, length + 0.002), (0.0, length + 0.002)]  # fmt: skip
-    return [revolve(shell, colour, 30), revolve(lid, LIGHT, 26)]
+    shell = [(0.0, GAP), (radius, GAP), (radius, length), (0.0, length)]
+    lid = [(cap - 0.006, length - 0.002), (cap - 0.006, length + 0.002), (0.0, length + 0.002)]
+    return [lathe(shell, colour, 30, 0.006), lathe(lid, LIGHT)]
 
 
 def seam(z: float, radius: float = TUBE - 0.0015, depth: float = 0.006) -> Piece:
     """The dark ring that shows in the groove at the end of a tube along z."""
-    return revolve([(0.0, z - depth), (radius, z - depth), (radius, z + depth), (0.0, z + depth)], DARK, 30)
+    return band(radius, z - depth, z + depth, DARK)
 
 
 def base() -> list[Piece]:
@@ -79,8 +77,8 @@ def base() -> list[Piece]:
             (0.138, 0.0, 0.0, 0.0, 0.0, 2.0),
         ]
     )
-    ring = revolve([(0.0, 0.132), (0.0572, 0.132), (0.0572, 0.137), (0.0, 0.137)], LED, 36)
-    panel = slab(0.085, 0.030, [(0.003, 0.0), (0.0, 0.004), (0.0, 0.020), (0.003, 0.024)], 0.004, DARK, 4)
+    ring = band(0.0574, 0.131, 0.136, LED, 36)
+    panel = slab(0.085, 0.030, rim(0.0, 0.024, 0.004), 0.006, DARK, 4)
     upright = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     return [body(foot, WHITE, (26, 44)), ring, panel.moved(upright, (-0.134, 0.0, 0.028)), seam(0.139)]
 
@@ -134,18 +132,18 @@ def wrist() -> list[Piece]:
     )
     shell = [(0.0, -0.079), (0.036, -0.079), (0.042, -0.075), (0.0445, -0.065), (0.0445, 0.045), (0.042, 0.048),
              (0.0, 0.048)]  # fmt: skip
-    housing = revolve(shell, WHITE, 30).moved(ALONG_MINUS_Y, (0.088, 0, 0))
-    lid = revolve([(0.0, -0.081), (0.030, -0.081), (0.033, -0.0785), (0.0, -0.0785)], LIGHT, 26)
+    housing = lathe(shell, WHITE, 30).moved(ALONG_MINUS_Y, (0.088, 0, 0))
+    lid = lathe([(0.0, -0.081), (0.030, -0.081), (0.033, -0.0785), (0.0, -0.0785)], LIGHT, 26)
     return [across, *barrel(0.056, 0.0480, 0.038), housing, lid.moved(ALONG_MINUS_Y, (0.088, 0, 0)),
             seam(0.050, 0.0425, 0.004).moved(ALONG_MINUS_Y, (0.088, 0, 0))]  # fmt: skip
 
 
 def flange() -> list[Piece]:
     """Link 7: the flange, with the buttons on its side."""
-    disc = revolve(
+    disc = lathe(
         [(0.0, 0.053), (0.041, 0.053), (0.0435, 0.056), (0.0435, 0.090), (0.041, 0.094), (0.0, 0.094)], WHITE, 32
     )
-    plate = revolve([(0.0, 0.090), (0.0315, 0.090), (0.0315, 0.106), (0.0, 0.106)], GREY, 28)
+    plate = lathe([(0.0, 0.090), (0.0315, 0.090), (0.0315, 0.106), (0.0, 0.106)], GREY, 28)
     pilot = limb([(0.020, 0.020, 0.0755, 0.022), (0.036, 0.036, 0.0765, 0.021), (0.051, 0.051, 0.079, 0.019),
                   (0.061, 0.061, 0.081, 0.017)], WHITE, 8, 20)  # fmt: skip
     button = limb(
@@ -156,24 +154,23 @@ def flange() -> list[Piece]:
 
 def hand() -> list[Piece]:
     """The hand: a wide flat box, with a dark rail at the end in which the fingers slide."""
-    box = slab(0.203, 0.062, [(0.020, -0.002), (0.009, 0.002), (0.003, 0.010), (0.0, 0.024), (0.0, 0.052), (0.002,
-               0.057)],
-               0.026, WHITE, 6)  # fmt: skip
-    rail = slab(0.190, 0.044, [(0.001, 0.050), (0.0, 0.054), (0.0, 0.0645), (0.002, 0.0660)], 0.015, BLACK, 6)
-    neck = revolve([(0.0, -0.002), (0.0315, -0.002), (0.0315, 0.010), (0.0, 0.010)], GREY, 26)
+    box = slab(0.203, 0.062, rim(-0.002, 0.057, 0.012), 0.028, WHITE, 6)
+    rail = slab(0.190, 0.044, rim(0.045, 0.066, 0.003), 0.020, BLACK, 6)
+    neck = lathe([(0.0, -0.003), (0.0315, -0.003), (0.0315, 0.010), (0.0, 0.010)], GREY, 26)
     return [box, rail, neck]
 
 
 def finger(side: float) -> list[Piece]:
     """One finger: side 1 is the left one, which opens towards +y."""
-    block = slab(0.023, 0.020, [(0.001, 0.0), (0.0, 0.002), (0.0, 0.018), (0.002, 0.021)], 0.003, GREY, 3)
-    tip = Loft([(0.016, 0.0, 0.0, 0.0, 0.0, 5.0), (0.016, 0.0, 0.0095, 0.0095, 0.010, 5.0),
-                (0.030, 0.0, 0.0095, 0.0095, 0.0095, 5.0), (0.045, 0.0, 0.009, 0.009, 0.008, 5.0),
-                (0.0538, 0.0, 0.008, 0.008, 0.007, 5.0), (0.0538, 0.0, 0.0, 0.0, 0.0, 5.0)])  # fmt: skip
-    pad = slab(0.004, 0.0165, [(0.0, 0.036), (0.0, 0.0535)], 0.001, BLACK, 3)
-    return [block.moved(shift=(0.0, side * 0.0135, 0.0)), body(tip, GREY, (12, 24)).moved(shift=(0.0, side * 0.0105,
-            0.0)),
-            pad.moved(shift=(0.0, side * 0.002, 0.0))]  # fmt: skip
+    foot = [(0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0095, 0.0095, 0.0115), (0.015, 0.0, 0.0095, 0.0095, 0.0115),
+            (0.022, 0.0, 0.009, 0.009, 0.0105), (0.037, 0.0, 0.009, 0.009, 0.0090)]  # fmt: skip
+    tip = [(0.034, 0.0, 0.009, 0.009, 0.0090), (0.046, 0.0, 0.009, 0.009, 0.0080), (0.0538, 0.0, 0.008, 0.008, 0.0070),
+           (0.0538, 0.0, 0.0, 0.0, 0.0)]  # fmt: skip
+    shapes = [(foot, GREY, (14, 28)), (tip, BLACK, (8, 28))]
+    return [
+        body(Loft([(*key, 3.5) for key in keys]), colour, size).moved(shift=(0.0, side * 0.0118, 0.0))
+        for keys, colour, size in shapes
+    ]
 
 
 def links() -> dict[str, list[Piece]]:

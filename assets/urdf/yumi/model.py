@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from modelling.description import ZERO, Joint, Z
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, WHITE
-from modelling.surfaces import Y_AXIS, Array, Loft, Piece, body, limb, revolve, slab, tube
+from modelling.surfaces import Y_AXIS, Array, Loft, Piece, band, body, lathe, limb, rim, slab, tube
 
 ROOT = "yumi_base_link"
 
@@ -64,15 +64,11 @@ def turned_to(direction: str) -> Array:
 def drum(low: float, high: float, radius: float) -> list[Piece]:
     """A joint's housing along z with a soft dome at the far end and a dark joint at the near one."""
     near, far = (low, high) if abs(low) < abs(high) else (high, low)
-    way = 1.0 if far > near else -1.0
-    profile = [(0.0, near + way * 0.003), (radius - 0.002, near + way * 0.003), (radius, near + way * 0.006)]
-    depth = abs(far - near)
-    profile += [(radius, near + way * 0.72 * depth), (0.93 * radius, near + way * 0.90 * depth)]
-    profile += [(0.72 * radius, near + way * 0.985 * depth), (0.4 * radius, far), (0.0, far)]
-    ring = [(0.0, near), (0.93 * radius, near), (0.93 * radius, near + way * 0.008), (0.0, near + way * 0.008)]
-    if way < 0:
-        profile, ring = profile[::-1], ring[::-1]
-    return [revolve(profile, WHITE, 30), revolve(ring, DARK, 30)]
+    way, depth = (1.0 if far > near else -1.0), abs(far - near)
+    profile = [(0.0, near + way * 0.005), (radius, near + way * 0.005), (radius, near + way * 0.80 * depth),
+               (0.72 * radius, far), (0.0, far)]  # fmt: skip
+    inner = near + way * 0.008
+    return [lathe(profile[:: int(way)], WHITE, 30, 0.012), band(0.93 * radius, min(near, inner), max(near, inner), DARK)]
 
 
 def trunk() -> list[Piece]:
@@ -96,13 +92,12 @@ def trunk() -> list[Piece]:
          (-0.205, 0.345, 0.122), (-0.140, 0.378, 0.118), (-0.060, 0.388, 0.108), (0.000, 0.390, 0.098)]
     )  # fmt: skip
     spine = limb([(x, 0.0, z, radius) for x, z, radius in path], WHITE, 22, 40, 0.03)
-    chest = revolve([(0.0, 0.0), (0.070, 0.0), (0.074, 0.004), (0.066, 0.010), (0.0, 0.012)], GREY, 36)
+    chest = lathe([(0.0, 0.0), (0.074, 0.0), (0.070, 0.011), (0.0, 0.012)], GREY, 36)
     forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    plate = slab(0.30, 0.20, [(0.004, -0.105), (0.0, -0.101), (0.0, -0.096), (0.004, -0.092)], 0.03, DARK, 6)
-    light = revolve([(0.0, 0.0), (0.012, 0.0), (0.012, 0.006), (0.0, 0.008)], LED, 18)
+    light = lathe([(0.0, 0.0), (0.012, 0.0), (0.012, 0.006), (0.0, 0.008)], LED, 18)
     stretched = Piece(spine.vertices * (1.0, 1.08, 1.0), spine.faces, spine.colour)
     return [body(foot, WHITE, (30, 52)), stretched, chest.moved(forward, (0.004, 0.0, 0.392)), *mounts(),
-            plate.moved(shift=(-0.17, 0.0, 0.0)), light.moved(shift=(-0.02, 0.0, 0.487))]  # fmt: skip
+            light.moved(shift=(-0.02, 0.0, 0.487))]  # fmt: skip
 
 
 def mounts() -> list[Piece]:
@@ -120,7 +115,7 @@ def mounts() -> list[Piece]:
             (0.062, -0.002),
             (0.0, -0.002),
         ]
-        pieces.append(revolve(ring, LIGHT, 34).moved(turn, [float(value) for value in origin]))
+        pieces.append(lathe(ring, LIGHT, 34).moved(turn, [float(value) for value in origin]))
     return pieces
 
 
@@ -138,7 +133,7 @@ def about_z(angle: float) -> Array:
 
 def collar(radius: float) -> Piece:
     """The dark ring at the root of a link, about z."""
-    return revolve([(0.0, -0.002), (radius, -0.002), (radius, 0.006), (0.0, 0.006)], DARK, 30)
+    return band(radius, -0.002, 0.006, DARK)
 
 
 def first() -> list[Piece]:
@@ -192,13 +187,13 @@ def sixth() -> list[Piece]:
 
 def joint_core(radius: float, half: float = 0.010) -> Piece:
     """The dark shaft that shows between the two housings of a joint along z."""
-    return revolve([(0.0, -half), (radius, -half), (radius, half), (0.0, half)], DARK, 28)
+    return band(radius, -half, half, DARK)
 
 
 def seventh() -> list[Piece]:
     """Link 7: the flange."""
     return [
-        revolve(
+        lathe(
             [(0.0, -0.009), (0.027, -0.009), (0.030, -0.006), (0.030, 0.005), (0.028, 0.0075), (0.0, 0.0075)], DARK, 28
         )
     ]
@@ -218,14 +213,14 @@ def gripper() -> list[Piece]:
             (0.0825, 0.0, 0.0, 0.0, 0.0, 3.0),
         ]
     )
-    slot = slab(0.030, 0.058, [(0.001, 0.078), (0.0, 0.080), (0.0, 0.086), (0.002, 0.088)], 0.010, BLACK, 4)
-    lens = revolve([(0.0, 0.0), (0.009, 0.0), (0.009, 0.003), (0.0, 0.004)], BLACK, 20)
+    slot = slab(0.030, 0.058, rim(0.074, 0.088, 0.002), 0.010, BLACK, 4)
+    lens = lathe([(0.0, 0.0), (0.009, 0.0), (0.009, 0.003), (0.0, 0.004)], BLACK, 20)
     return [body(shell, WHITE, (22, 36)), slot, lens.moved(turned_to("y"), (0.0, 0.033, 0.042))]
 
 
 def finger() -> list[Piece]:
     """One finger, which closes at x = 0."""
-    foot = slab(0.020, 0.009, [(0.001, 0.0), (0.0, 0.001), (0.0, 0.016), (0.002, 0.018)], 0.002, GREY, 3)
+    foot = slab(0.020, 0.009, rim(0.0, 0.018, 0.002), 0.003, GREY, 3)
     tip = tube(np.array([(-0.0058, 0.0065, 0.012), (-0.0055, 0.0065, 0.030), (-0.0047, 0.0065, 0.049)]),
                np.array([0.0056, 0.0052, 0.0042]), GREY, 14, 0.001)  # fmt: skip
     return [foot.moved(shift=(-0.0055, 0.006, 0.0)), tip]
