@@ -95,6 +95,8 @@ def read_train_config(file: Path) -> dict[str, Any]:
     """
     table = read_toml(file)
     check_keys(table, TRAIN.keys() | OPTIONS.keys(), str(file))
+    if "dataset" not in table:
+        raise UserError(f'{file}: dataset is missing; for example: dataset = "nuisi"')
     values = {key: converted(value, (OPTIONS | TRAIN)[key], f"{file}: {key}") for key, value in table.items()}
     epochs = values.pop("epochs", None)
     stages = dict.fromkeys(("human_epochs", "robot_epochs"), epochs) if epochs is not None else {}

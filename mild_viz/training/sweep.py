@@ -6,6 +6,7 @@ import shlex
 import shutil
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -57,7 +58,8 @@ def sweep(file: Path, jobs: int | None = None, scheduler: str | None = None) -> 
     rows = [row for cell, found in done.items() for row in cell_rows(cell, found)]
     failed, since = [], time.monotonic()
     try:
-        with _outcomes(waiting, out, command, jobs, scheduler) as outcomes:
+        with warnings.catch_warnings(), _outcomes(waiting, out, command, jobs, scheduler) as outcomes:
+            warnings.filterwarnings("ignore", ".*still being processed", UserWarning)  # joblib's words on Ctrl-C
             for count, outcome in enumerate(outcomes, 1):
                 found = _keep(outcome, out)
                 made = [] if found is None else cell_rows(outcome.cell, found)
@@ -68,7 +70,7 @@ def sweep(file: Path, jobs: int | None = None, scheduler: str | None = None) -> 
                     failed.append(outcome.cell)
                 _say(_line(outcome, made, count, len(waiting), since))
     except KeyboardInterrupt:
-        left = len(cells) - len({row["cell"] for row in rows})
+        left = sum(finished(cell, out) is None for cell in cells)
         where = f" --jobs {jobs}" if jobs else f" --scheduler {scheduler}" if scheduler else ""
         print(f"interrupted with {left} of {len(cells)} cells to do. Go on with:\n  {command}{where}", file=sys.stderr)
         raise

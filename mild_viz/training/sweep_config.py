@@ -135,7 +135,7 @@ def _check(config: SweepConfig, where: str) -> None:
         except UserError as error:
             raise UserError(f"{where}: {error}") from None
     for seed in config.seeds:
-        make_options({"seed": seed}, where)
+        make_options({**config.options, "seed": seed}, where)
     for key, values in config.grid.items():
         for value in values:
             make_options({**config.options, key: value}, where)

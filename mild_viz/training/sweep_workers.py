@@ -41,8 +41,11 @@ class Outcome:
     @classmethod
     def failed(cls, cell: Cell, error: BaseException, seconds: float = 0.0) -> Outcome:
         """The outcome of a cell that ended with an error."""
-        words = "".join(traceback.format_exception_only(error)).splitlines()
-        return cls(cell, seconds, words[0], "".join(traceback.format_exception(error)))
+        root = error
+        while root.__cause__ is not None:
+            root = root.__cause__
+        line = "".join(traceback.format_exception_only(root)).splitlines()[0]
+        return cls(cell, seconds, line, "".join(traceback.format_exception(error)))
 
 
 def checksum(dataset: str) -> str | None:
