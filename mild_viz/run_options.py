@@ -44,6 +44,12 @@ def documented(command: T) -> T:
     return command
 
 
+def leave(status: int | None) -> None:
+    """End the program with a status that is not 0."""
+    if status:
+        raise SystemExit(status)
+
+
 def check_output(path: Path, suffix: str) -> None:
     """Refuse a file that cannot be written before the work is done, not after."""
     if path.suffix.lower() != suffix:

@@ -89,12 +89,12 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
                 loaded = load_checkpoint(built)
             except UserError as error:
                 raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
-            if target.exists():
-                os.replace(target, old)
             try:
+                if target.exists():
+                    os.replace(target, old)
                 os.replace(built, target)
-            except OSError:
-                if old.exists():
+            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
+                if old.exists() and not target.exists():
                     os.replace(old, target)
                 raise
         finally:
