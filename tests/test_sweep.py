@@ -228,8 +228,8 @@ def test_settings_are_ranked_by_held_out_error_never_by_the_test_split() -> None
 
     def rows(beta: float, held_out: list[float], test: list[float]) -> list[dict[str, Any]]:
         return [
-            {"cell": f"{beta}-{seed}", "dataset": "demo", "variant": "v3.1", "seed": seed, "beta": beta, "action": action,
-             "held_out_mse": held_out[seed], "test_mse": test[seed]}
+            {"cell": f"{beta}-{seed}", "dataset": "demo", "variant": "v3.1", "seed": seed, "beta": beta,
+             "action": action, "held_out_mse": held_out[seed], "test_mse": test[seed]}
             for seed in range(len(held_out)) for action in ("wave", "handshake")
         ]  # fmt: skip
 

@@ -27,8 +27,8 @@ OPTIONS: dict[str, Any] = get_type_hints(TrainingOptions)
 TRAIN: dict[str, Any] = {
     name: hint
     for name, hint in get_type_hints(train).items()
-    if name not in ("options", "command", "quiet", "resume", "return")  # what a caller says, not a config
-}
+    if name not in ("options", "command", "quiet", "resume", "tensorboard", "return")  # a caller says these
+} | {"epochs": int}
 """Every other key of a training config and its type: the parameters of `train`."""
 
 KINDS: dict[Any, str] = {int: "a whole number", float: "a finite number", str: "a text", bool: "true or false"}
@@ -99,16 +99,18 @@ def read_train_config(file: Path) -> dict[str, Any]:
         raise UserError(f'{file}: dataset is missing; for example: dataset = "nuisi"')
     values = {key: converted(value, (OPTIONS | TRAIN)[key], f"{file}: {key}") for key, value in table.items()}
     epochs = values.pop("epochs", None)
-    stages = dict.fromkeys(("human_epochs", "robot_epochs"), epochs) if epochs is not None else {}
+    stages = dict.fromkeys(("human_epochs", "robot_epochs", "joint_epochs"), epochs) if epochs is not None else {}
     if both := sorted(stages.keys() & values.keys()):
-        raise UserError(f"{file}: epochs stands for both stages; leave out {', '.join(both)}, or epochs")
+        raise UserError(f"{file}: epochs stands for all stages; leave out {', '.join(both)}, or epochs")
     options = {key: values.pop(key) for key in OPTIONS if key in values}
     return {**values, "options": make_options(options | stages, str(file))}
 
 
-def train_from_config(file: Path, out: Path | None = None, resume: bool = False) -> Checkpoint:
+def train_from_config(
+    file: Path, out: Path | None = None, resume: bool = False, tensorboard: Path | None = None
+) -> Checkpoint:
     """What `mild-viz train --config FILE` does; `out` stands for the folder that the file names."""
     values = read_train_config(file)
     words = ["mild-viz", "train", "--config", str(file), *(["--out", str(out)] if out else [])]
     folder = out or values.pop("out", None) or Path("runs") / file.stem
-    return train(**{**values, "out": folder}, resume=resume, command=shlex.join(words))
+    return train(**{**values, "out": folder}, resume=resume, tensorboard=tensorboard, command=shlex.join(words))

@@ -94,7 +94,7 @@ class RunState:
         if not file.is_file():
             return None
         try:
-            return torch.load(file, weights_only=True)
+            return torch.load(file, weights_only=True, map_location="cpu")
         except Exception:  # a damaged pickle leads torch into any of a dozen errors
             raise UserError(f"{file} is damaged; remove {self.folder} to start anew") from None
 
