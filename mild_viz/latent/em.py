@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -174,15 +174,17 @@ def fit(
     n_iterations: int,
     tolerance: float = 1e-3,
     transition_floor: float = TRANSITION_FLOOR,
+    step: Callable[[Any, Observations, float, float], tuple[HMM, float]] = em_step,
 ) -> tuple[HMM, list[float]]:
     """EM from a start until the log-likelihood per step rises by less than `tolerance`, or `n_iterations`.
 
-    Returns the model and the log-likelihood before every iteration.
+    `step` is one iteration for the start's kind of model. Returns the model and the log-likelihood before every
+    iteration.
     """
     observations = Observations.of(sequences)
     history: list[float] = []
     for _ in range(n_iterations):
-        hmm, total = em_step(hmm, observations, floor, transition_floor)
+        hmm, total = step(hmm, observations, floor, transition_floor)
         converged = bool(history) and abs(total - history[-1]) < tolerance * len(observations.rows)
         history.append(total)
         if converged:
