@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mild_viz.evaluation.baselines import BASELINES
 from mild_viz.evaluation.metrics import Row
 from mild_viz.evaluation.runs import MEAN, OverRuns
 from mild_viz.evaluation.significance import LEVEL, N_RESAMPLES, POOLED, SEED, Comparison
@@ -25,7 +26,7 @@ def error_table(rows: Sequence[Row], caption: str) -> TextTable:
     sections: dict[str, list[tuple[str, ...]]] = {"variant": [], "baseline": [], "paper": []}
     values = []
     for (model, checkpoint), cells in lines.items():
-        kind = "paper" if model.startswith("paper") else "variant" if model.startswith("v") else "baseline"
+        kind = "paper" if model.startswith("paper") else "baseline" if model in BASELINES else "variant"
         means = [cells[action].mse_mean if action in cells else np.nan for action in actions]
         texts = [
             f"{cells[action].mse_mean:.{digits}f} ± {cells[action].mse_std:.{digits}f}" if action in cells else ""
@@ -74,27 +75,27 @@ def comparison_table(comparisons: Sequence[Comparison], unit: str, each_action: 
     digits = _digits([abs(one.difference) for one in comparisons])
     for one in shown:
         section = sections.setdefault((one.first, one.second), [])
-        interval = "" if np.isnan(one.low) else f" [{one.low:.{digits}f}, {one.high:.{digits}f}]"
+        tests = (
+            (one.mann_whitney_p, one.mann_whitney_p_holm),
+            (one.sign_flip_p, one.sign_flip_p_holm),
+            (one.wilcoxon_p, one.wilcoxon_p_holm),
+        )
         section.append(
             (
                 "" if section else f"{one.first} − {one.second}",
                 *([one.action] if each_action else []),
-                str(one.n_trials),
-                f"{one.difference:.{digits}f}{interval}",
-                f"{one.a12:.2f}",
-                *(f"{_p(p)} ({_p(holm)})" for p, holm in (
-                    (one.mann_whitney_p, one.mann_whitney_p_holm),
-                    (one.sign_flip_p, one.sign_flip_p_holm),
-                    (one.wilcoxon_p, one.wilcoxon_p_holm),
-                )),
-                _p(one.smallest_p),
+                f"{one.n_trials} ({_p(one.smallest_p)})",
+                f"{one.difference:+.{digits}f}",
+                "" if np.isnan(one.low) else f"[{one.low:+.{digits}f}, {one.high:+.{digits}f}]",
+                _bare(f"{one.a12:.2f}"),
+                *(f"{_p(p)} ({_p(corrected)})" for p, corrected in tests),
                 one.conclusion,
             )
-        )  # fmt: skip
+        )
     header = (
-        "first − second", *(["action"] if each_action else []), "trials", f"difference [{unit}]\n[95 % interval]",
-        "A12", "Mann-Whitney U\nwindows: p (Holm)", "sign-flip\ntrials: p (Holm)", "Wilcoxon\ntrials: p (Holm)",
-        "smallest\nattainable p", "conclusion",
+        "first − second", *(["action"] if each_action else []), "trials\n(smallest p)", f"difference\n[{unit}]",
+        "95 % interval\nover trials", "A12", "Mann-Whitney U\nover windows\np (Holm)",
+        "sign-flip\nover trials\np (Holm)", "Wilcoxon\nover trials\np (Holm)", "conclusion",
     )  # fmt: skip
     rows = list(sections.values())
     grouped = rows if each_action else [[row for section in rows for row in section]]
@@ -116,10 +117,12 @@ def _notes(shown: Sequence[Comparison]) -> list[str]:
     notes = [
         "Difference: mean error of the first minus the second, below 0 where the first is better; over all actions, "
         f"every action counts equally. Interval: whole trials resampled within their action ({N_RESAMPLES} times, "
-        f"seed {SEED}), expanded percentiles; from few trials it is still too narrow.",
-        "A12: chance that a window of the first has the larger error (0.5: neither; below 0.29 or above 0.71: large).",
+        f"seed {SEED}), expanded percentiles, not corrected for the number of comparisons; from few trials it is still "
+        "too narrow.",
+        "Smallest p: what the tests over trials can give at best with so many trials.",
+        "A12: chance that a window of the first has the larger error (.5: neither; below .29 or above .71: large).",
         "Mann-Whitney U is the paper's window-level test. Windows of a trial overlap and are not independent, "
-        "so its p is far too small; it is given for comparison with the paper, and nothing is concluded from it.",
+        "so its p is too small; it is given for comparison with the paper, and nothing is concluded from it.",
         "Sign-flip and Wilcoxon's signed-rank test are paired and two-sided, on the mean errors of the trials. "
         f"Holm's correction: {families}. The conclusion follows the corrected sign-flip test at {LEVEL}.",
     ]
@@ -139,7 +142,12 @@ def _notes(shown: Sequence[Comparison]) -> list[str]:
 
 
 def _p(value: float) -> str:
-    return "<0.001" if value < 0.001 else f"{value:.3f}"
+    return "<.001" if value < 0.001 else _bare(f"{value:.3f}")
+
+
+def _bare(number: str) -> str:
+    """A number that cannot exceed 1, without its leading zero."""
+    return number.removeprefix("0") if number.startswith("0.") else number
 
 
 def _digits(values: Sequence[float]) -> int:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.data.load import load_dataset
@@ -28,7 +27,7 @@ from mild_viz.evaluation.metrics import (
 )
 from mild_viz.evaluation.runs import MEAN, OverRuns, over_checkpoints, over_recorded_seeds
 from mild_viz.evaluation.significance import Comparison, compare
-from mild_viz.evaluation.tables import TextTable, to_latex, to_markdown, to_rich
+from mild_viz.evaluation.tables import TextTable, print_tables, to_latex, to_markdown
 from mild_viz.files import write_atomically
 from mild_viz.pairs import check_rate, stack_windows
 from mild_viz.settings import choose
@@ -133,8 +132,8 @@ def measure(checkpoints: dict[str, Checkpoint], dataset: Dataset, pairs: Sequenc
     ]
     baselines = measure_baselines(dataset.name, train, test, joints is None)
     over_runs = over_checkpoints(variants)
-    for _, model in models:
-        over_runs += over_recorded_seeds(model, dataset.name)
+    for name, model in models:
+        over_runs += over_recorded_seeds(name, model, dataset.name)
     named = {measured.model: measured for measured in baselines}
     chosen = [(name, REFERENCE) for name in dict.fromkeys(one.model for one in variants)]
     for name, _ in chosen:
@@ -173,10 +172,7 @@ def evaluate(
         path.name if named.count(path.name) == 1 else str(path): load_checkpoint(path) for path in paths
     }  # names that tell them apart
     result = measure(models, load_dataset(dataset), pairs)
-    console = Console(width=None if Console().is_terminal else 160)
-    for table in result.tables(each_action=bool(pairs)):
-        console.print(to_rich(table))
-        console.print()
+    print_tables(result.tables(each_action=bool(pairs)))
     tables = result.tables()
     texts = {
         json: lambda: json_format.dumps(_finite(result.as_json()), indent=2, allow_nan=False) + "\n",

@@ -80,7 +80,7 @@ def over_checkpoints(measured: Sequence[Measured]) -> list[OverRuns]:
     return result
 
 
-def over_recorded_seeds(checkpoint: Checkpoint, dataset: str) -> list[OverRuns]:
+def over_recorded_seeds(name: str, checkpoint: Checkpoint, dataset: str) -> list[OverRuns]:
     """Best and median over the seeds of a training run, as its checkpoint's metrics["test_seeds"] records them.
 
     That is a list over seeds of rows as metrics["test"] has them. Empty where it is absent or of another dataset.
@@ -100,7 +100,7 @@ def over_recorded_seeds(checkpoint: Checkpoint, dataset: str) -> list[OverRuns]:
             summary
             for model, runs in seeds.items()
             if len(runs) > 1
-            for summary in best_and_median(dataset, model, runs, f"record of {checkpoint.name}")
+            for summary in best_and_median(dataset, model, runs, f"record of {name}")
         ]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(

@@ -41,7 +41,7 @@ class Comparison:
     a12: float
     """Vargha and Delaney's A: chance that a window of the first has the larger error (ties count half)."""
     mann_whitney_p: float
-    """The paper's test, over windows. They overlap and are not independent: the p is far too small."""
+    """The paper's test, over windows. They overlap and are not independent: the p is too small."""
     sign_flip_p: float
     """Paired test of the trials' mean errors, by flipping the signs of their differences."""
     wilcoxon_p: float
@@ -60,9 +60,9 @@ class Comparison:
         if np.isnan(self.difference):
             return "a prediction is not a number"
         if self.smallest_p > LEVEL:
-            return f"too few trials (p >= {self.smallest_p:.2g})"
+            return "too few trials"
         if self.smallest_p_holm > LEVEL:
-            return f"too few trials for so many comparisons (p >= {self.smallest_p_holm:.2g})"
+            return "too few for so many pairs"
         if self.sign_flip_p_holm > LEVEL:
             return "no difference shown"
         return f"{self.first if self.difference < 0 else self.second} is better"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -47,6 +49,18 @@ def to_rich(table: TextTable) -> Table:
     return result
 
 
+def print_tables(tables: Sequence[TextTable]) -> None:
+    """Print to the terminal, in its width; a file or a pipe has none to which cells must be broken."""
+    rendered = [to_rich(table) for table in tables]
+    console = Console()
+    if not console.is_terminal:
+        unbounded = console.options.update(width=1000)
+        console = Console(width=max(160, *(console.measure(table, options=unbounded).maximum for table in rendered)))
+    for table in rendered:
+        console.print(table)
+        console.print()
+
+
 def to_markdown(table: TextTable) -> str:
     """A pipe table under its caption; columns are padded, so that it is legible as it stands."""
 
@@ -82,10 +96,10 @@ LATEX = {
 
 
 def latex_text(text: str) -> str:
-    """Plain text as LaTeX; a minus sign stands before a number, a hyphen elsewhere."""
-    text = re.sub(r"[\\{}$&%#_~^<>±²×−]", lambda match: LATEX[match[0]], text).replace(">=", r"$\geq$")
-    text = text.replace("$>$=", r"$\geq$")
-    return re.sub(r"(?<![\w.])-(?=\.?\d)", "$-$", text)
+    """Plain text as LaTeX; minus signs before numbers, opening quotes and a lone p are set as such."""
+    text = re.sub(r"[\\{}$&%#_~^<>±²×−]", lambda match: LATEX[match[0]], text)
+    text = re.sub(r"(?<![\w.])([-+])(?=\.?\d)", r"$\1$", text)
+    return re.sub(r"(?<!\w)'(?=\w)", "`", re.sub(r"(?<![\w\\])p(?!\w)", "$p$", text))
 
 
 def to_latex(table: TextTable, label: str) -> str:
@@ -94,7 +108,8 @@ def to_latex(table: TextTable, label: str) -> str:
     heads = [name.split(NEWLINE) + [""] * (n_lines - 1 - name.count(NEWLINE)) for name in table.header]
     lines = [
         r"\begin{table*}",
-        r"  \centering\small",
+        # Sizes that fit the width of a two-column page.
+        r"  \centering" + (r"\scriptsize\setlength{\tabcolsep}{2.5pt}" if len(heads) > 7 else r"\footnotesize"),
         f"  \\caption{{{latex_text(table.caption)}}}",
         f"  \\label{{{label}}}",
         f"  \\begin{{tabular}}{{@{{}}{''.join('l' if i in table.words else 'r' for i in range(len(heads)))}@{{}}}}",
