@@ -98,7 +98,10 @@ def sign_flip_p(differences: Float[np.ndarray, " n"], rng: np.random.Generator) 
 def wilcoxon_p(differences: Float[np.ndarray, " n"]) -> float:
     """Two-sided p of Wilcoxon's signed-rank test; differences of 0 are left out, as he did."""
     differences = differences[differences != 0]
-    return float(stats.wilcoxon(differences).pvalue) if len(differences) else 1.0
+    if not len(differences):
+        return 1.0
+    _, p = stats.wilcoxon(differences)
+    return float(p)
 
 
 def bootstrap_interval(
@@ -127,7 +130,7 @@ def bootstrap_interval(
         return np.mean([sums[index].sum(axis) / counts[index].sum(axis) for index in trials], axis=0)
 
     n, freedom = len(sums), len(sums) - len(members)
-    tail = stats.norm.cdf(-np.sqrt(n / freedom) * stats.t.ppf(1 - LEVEL / 2, freedom))
+    tail = float(stats.norm.cdf(-np.sqrt(n / freedom) * stats.t.ppf(1 - LEVEL / 2, freedom)))
     interval = stats.bootstrap(
         members,
         mean,
