@@ -17,6 +17,7 @@ from mild_viz.evaluation.significance import (
     bootstrap_interval,
     compare,
     holm,
+    holm_p,
     sign_flip_p,
     smallest_p,
     wilcoxon_p,
@@ -35,7 +36,7 @@ def compared(first: Measured, second: Measured) -> dict[str, Comparison]:
     return {one.action: one for one in compare([(("a", first), ("b", second))])}
 
 
-def enumerated(differences: np.ndarray, statistic: object = None) -> float:
+def enumerated(differences: np.ndarray) -> float:
     """Two-sided p of |sum| over all signs."""
     signs = np.array(list(product((-1, 1), repeat=len(differences))))
     sums = np.abs(signs @ differences)
@@ -170,6 +171,9 @@ def test_holm_by_hand() -> None:
     for test in ("mann_whitney", "sign_flip", "wilcoxon"):
         assert [getattr(one, f"{test}_p_holm") for one in corrected] == pytest.approx([0.03, 0.06, 0.06])
     assert [one.sign_flip_p_holm for one in holm([comparison(0.6), comparison(0.7)])] == [1.0, 1.0]
+    # .005 x 4, .011 x 3, .03 x 2, and .04 x 1 is not let below the one before it; NaN is no test
+    p = np.array([0.005, np.nan, 0.04, 0.011, 0.03])
+    np.testing.assert_allclose(holm_p(p), [0.02, np.nan, 0.06, 0.033, 0.06])
 
 
 def test_actions_and_their_pool_are_separate_families() -> None:
