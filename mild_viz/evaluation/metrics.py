@@ -142,12 +142,15 @@ def measure_model(dataset: str, checkpoint: Checkpoint, data: Windows) -> list[M
     """Every variant of a checkpoint on windows of one dataset."""
     for action in dict.fromkeys(data.actions):
         _complete(data, action)
-    human_human = checkpoint.robot is None
-    variants = ("v1",) if human_human else checkpoint.variants
     return [
-        _measured(dataset, variant, data, predict_windows(checkpoint, variant, data), human_human)
-        for variant in variants
+        _measured(dataset, variant, data, predict_windows(checkpoint, variant, data), checkpoint.robot is None)
+        for variant in measured_variants(checkpoint)
     ]
+
+
+def measured_variants(checkpoint: Checkpoint) -> tuple[str, ...]:
+    """What a checkpoint is measured as; a human-human model is the paper's v1."""
+    return ("v1",) if checkpoint.robot is None else checkpoint.variants
 
 
 def model_rows(checkpoint: Checkpoint, trials: Sequence[Trial]) -> list[Row]:
