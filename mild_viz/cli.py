@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mild_viz import paths
+from mild_viz.cli_evaluation import report
 from mild_viz.errors import UserError
 from mild_viz.run_options import (
     OptionalInt,
@@ -260,6 +261,7 @@ COMMANDS = {
     "data": data,
     "train": train,
     "evaluate": evaluate,
+    "report": report,
     "rollout": rollout,
     "record": record,
     "import-published": import_published,

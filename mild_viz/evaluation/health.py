@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,91 +40,102 @@ COVERED = 0.5
 the outcomes are then called nearly impossible."""
 
 
+KINDS = {
+    "dead state": f"States that are active in fewer than {DEAD_OCCUPANCY:.1%} of the training windows: the model works "
+    "with fewer states than it has.",
+    "collapsed covariance": "States whose covariance is flat in some direction: what they know there is the floor that "
+    "training adds, and tiny deviations decide which state is active.",
+    "idle forward variable": "The forward variable is not informative: it hardly tells states apart or changes.",
+    "no contact state": "No contact state is set for an interaction in which the partners touch: mild-ik never adapts "
+    "the hand.",
+    "worse than a constant": "The prediction is no better than the mean partner window of the action.",
+    "misaligned encoder": "Human-only and joint forward variable disagree in most windows: the partner's encoder and "
+    "the state model have drifted apart, or the human's motion does not show the partner's.",
+    "overconfident": "The predictive covariance calls most of what happens nearly impossible: it is too small, or the "
+    "partner's encoder and the state model have drifted apart.",
+}
+"""What each kind of warning means, worst first."""
+
+
 @dataclass(frozen=True)
 class Warning:
     """Something that a person should know before reading the figures."""
 
     kind: str
-    """dead state, collapsed covariance, idle forward variable, misaligned encoder, overconfident, no contact state."""
-    where: str
-    """Model and action."""
-    text: str
+    """One of `KINDS`."""
+    model: str
+    action: str
+    detail: str
+    """The figure that it rests on."""
+
+    def __str__(self) -> str:
+        return f"{self.model}, {self.action}: {self.kind} ({self.detail}). {KINDS[self.kind]}"
 
 
-def dead_states(where: str, used: Segmentation) -> list[Warning]:
+def dead_states(model: str, used: Segmentation) -> list[Warning]:
     """States that are hardly ever active in these trials (those that the model was trained on)."""
     dead = [state for state, share in enumerate(used.occupancy) if share < DEAD_OCCUPANCY]
-    if not dead:
-        return []
-    states = f"state {dead[0]} is" if len(dead) == 1 else f"states {', '.join(map(str, dead))} are"
-    text = (
-        f"{states} active in fewer than {DEAD_OCCUPANCY:.1%} of {used.n_windows} training windows: dead. "
-        "The model works with fewer states than it has"
-    )
-    return [Warning("dead state", where, text)]
+    return [Warning("dead state", model, used.action, _states(dead))] if dead else []
 
 
-def collapsed_covariances(where: str, hmm: HMM, floor: float | None) -> list[Warning]:
+def collapsed_covariances(model: str, action: str, hmm: HMM, floor: float | None) -> list[Warning]:
     """States whose covariance is flat in some direction; `floor` is what training added to each variance, if known."""
     eigenvalues = np.linalg.eigvalsh(hmm.emission_covariances)
-    smallest, condition = eigenvalues[:, 0], eigenvalues[:, -1] / eigenvalues[:, 0]
+    condition = eigenvalues[:, -1] / eigenvalues[:, 0]
+    at_floor = eigenvalues[:, 0] < NEAR_FLOOR * (floor or 0.0)
     warnings = []
-    for state in range(hmm.n_states):
-        if floor is not None and smallest[state] < NEAR_FLOOR * floor:
-            text = (
-                f"state {state} has collapsed: the smallest eigenvalue of its covariance, {smallest[state]:.2g}, is "
-                f"nothing but the floor of {floor:.2g} that training adds"
-            )
-        elif condition[state] > LARGEST_CONDITION:
-            text = (
-                f"state {state} has collapsed: the eigenvalues of its covariance differ by a factor of "
-                f"{condition[state]:.2g}"
-            )
-        else:
-            continue
-        warnings.append(Warning("collapsed covariance", where, text))
+    for found, why in (
+        (at_floor, f"smallest eigenvalue {eigenvalues[:, 0].min():.2g}, floor {floor or 0.0:.2g}"),
+        (~at_floor & (condition > LARGEST_CONDITION), f"eigenvalues differ by a factor of {condition.max():.2g}"),
+    ):
+        states = np.flatnonzero(found).tolist()
+        if states:
+            warnings.append(Warning("collapsed covariance", model, action, f"{_states(states)}: {why}"))
     return warnings
 
 
-def idle_alpha(where: str, used: Segmentation) -> list[Warning]:
+def idle_alpha(model: str, used: Segmentation) -> list[Warning]:
     """A forward variable that does not segment: undecided, in one state, or without any change."""
     share = max(used.occupancy)
     if used.entropy > IDLE_ENTROPY:
-        text = f"the forward variable is not informative: its mean entropy is {used.entropy:.0%} of the largest"
+        detail = f"its mean entropy is {used.entropy:.0%} of the largest"
     elif used.changes == 0:
-        text = "the forward variable is not informative: the active state never changes"
+        detail = "the active state never changes"
     elif share > ONE_STATE:
-        text = (
-            f"the forward variable is not informative: state {used.occupancy.index(share)} is active in "
-            f"{share:.0%} of the windows"
-        )
+        detail = f"state {used.occupancy.index(share)} is active in {share:.0%} of the windows"
     else:
         return []
-    return [Warning("idle forward variable", where, text)]
+    return [Warning("idle forward variable", model, used.action, detail)]
 
 
-def misaligned(where: str, used: Segmentation) -> list[Warning]:
+def misaligned(model: str, used: Segmentation) -> list[Warning]:
     """Human-only and joint forward variable that cut most windows differently."""
     if used.agreement >= ALIGNED:
         return []
-    text = (
-        f"human-only and joint forward variable agree in only {used.agreement:.0%} of the windows: the partner's "
-        "encoder and the state model have drifted apart, or the human's motion does not show the partner's"
-    )
-    return [Warning("misaligned encoder", where, text)]
+    return [Warning("misaligned encoder", model, used.action, f"same state in {used.agreement:.0%}")]
 
 
-def overconfident(where: str, measured: Calibration) -> list[Warning]:
+def overconfident(model: str, action: str, measured: Calibration) -> list[Warning]:
     """A predictive covariance that misses most of what happens."""
     inside = measured.coverage[LEVELS.index(0.9)]
     if inside >= COVERED:
         return []
-    text = f"the predictive covariance is too small: its 90 % ellipsoid holds {inside:.0%} of the true latents"
-    return [Warning("overconfident", where, text)]
+    return [Warning("overconfident", model, action, f"90 % ellipsoid holds {inside:.0%}")]
 
 
-def without_contact_state(where: str, action: str, states: Sequence[int]) -> list[Warning]:
+def without_contact_state(model: str, action: str, states: Collection[int]) -> list[Warning]:
     """An action in which the partners touch, for which the model knows no contact state."""
     if action not in CONTACT_ACTIONS or states:
         return []
-    return [Warning("no contact state", where, "no contact state is set, so that mild-ik never adapts the hand")]
+    return [Warning("no contact state", model, action, "none set")]
+
+
+def worse_than_constant(model: str, action: str, error: float, constant: float) -> list[Warning]:
+    """A mean squared error that the mean of the training windows reaches too."""
+    if error < constant:
+        return []
+    return [Warning("worse than a constant", model, action, f"{error / constant:.1f} times its error")]
+
+
+def _states(states: Sequence[int]) -> str:
+    return f"state{'s' if len(states) > 1 else ''} {', '.join(map(str, states))}"
