@@ -42,19 +42,20 @@ the outcomes are then called nearly impossible."""
 
 KINDS = {
     "dead state": f"States that are active in fewer than {DEAD_OCCUPANCY:.1%} of the training windows: the model works "
-    "with fewer states than it has.",
+    "with fewer states than it has:",
     "collapsed covariance": "States whose covariance is flat in some direction: what they know there is the floor that "
-    "training adds, and tiny deviations decide which state is active.",
-    "idle forward variable": "The forward variable is not informative: it hardly tells states apart or changes.",
-    "no contact state": "No contact state is set for an interaction in which the partners touch: mild-ik never adapts "
-    "the hand.",
-    "worse than a constant": "The prediction is no better than the mean partner window of the action.",
+    "training adds, and tiny deviations decide which state is active:",
+    "idle forward variable": "The forward variable is not informative: it hardly tells states apart or changes:",
+    "no contact state": "No contact state is set for an interaction in which the partners touch, so that mild-ik never "
+    "adapts the hand:",
+    "worse than a constant": "The prediction is no better than the mean partner window of the action. Its error "
+    "as a multiple of that one's:",
     "misaligned encoder": "Human-only and joint forward variable disagree in most windows: the partner's encoder and "
-    "the state model have drifted apart, or the human's motion does not show the partner's.",
+    "the state model have drifted apart, or the human's motion does not show the partner's. Windows in the same state:",
     "overconfident": "The predictive covariance calls most of what happens nearly impossible: it is too small, or the "
-    "partner's encoder and the state model have drifted apart.",
+    "partner's encoder and the state model have drifted apart. True latents within the 90 % ellipsoid:",
 }
-"""What each kind of warning means, worst first."""
+"""What each kind of warning means, and which figure follows, worst first."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Warning:
     """The figure that it rests on."""
 
     def __str__(self) -> str:
-        return f"{self.model}, {self.action}: {self.kind} ({self.detail}). {KINDS[self.kind]}"
+        return f"{self.model}, {self.action}: {self.kind}. {KINDS[self.kind]} {self.detail}"
 
 
 def dead_states(model: str, used: Segmentation) -> list[Warning]:
@@ -112,7 +113,7 @@ def misaligned(model: str, used: Segmentation) -> list[Warning]:
     """Human-only and joint forward variable that cut most windows differently."""
     if used.agreement >= ALIGNED:
         return []
-    return [Warning("misaligned encoder", model, used.action, f"same state in {used.agreement:.0%}")]
+    return [Warning("misaligned encoder", model, used.action, f"{used.agreement:.0%}")]
 
 
 def overconfident(model: str, action: str, measured: Calibration) -> list[Warning]:
@@ -120,7 +121,7 @@ def overconfident(model: str, action: str, measured: Calibration) -> list[Warnin
     inside = measured.coverage[LEVELS.index(0.9)]
     if inside >= COVERED:
         return []
-    return [Warning("overconfident", model, action, f"90 % ellipsoid holds {inside:.0%}")]
+    return [Warning("overconfident", model, action, f"{inside:.0%}")]
 
 
 def without_contact_state(model: str, action: str, states: Collection[int]) -> list[Warning]:
@@ -134,7 +135,7 @@ def worse_than_constant(model: str, action: str, error: float, constant: float) 
     """A mean squared error that the mean of the training windows reaches too."""
     if error < constant:
         return []
-    return [Warning("worse than a constant", model, action, f"{error / constant:.1f} times its error")]
+    return [Warning("worse than a constant", model, action, f"{error / constant:.1f}")]
 
 
 def _states(states: Sequence[int]) -> str:

@@ -21,6 +21,10 @@ REST, CONTACT = PHASES.index("rest"), PHASES.index("contact")
 BOUNDARIES = ("rest → reach", "reach → contact", "contact → return", "return → rest")
 """Phase changes whose time is measured: the first and the last moment of movement, and of contact."""
 
+LONGEST_DELAY = 1.0
+"""Entries into a state that are further apart than this are different events, not one that is seen late [s]:
+phases of these interactions last about a second."""
+
 
 @dataclass(frozen=True)
 class Segmentation:
@@ -47,7 +51,8 @@ class Segmentation:
     delay_frames: float | None
     """The same in frames."""
     matched: float
-    """Share of the joint active state's changes that have a counterpart: the human-only one enters that state too."""
+    """Share of the joint active state's changes that have a counterpart: the human-only one enters that state too,
+    within `LONGEST_DELAY`."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +93,21 @@ def back_transitions(active: Int[np.ndarray, " N"]) -> int:
     return len(visited) - len(np.unique(visited))
 
 
-def change_delays(reference: Int[np.ndarray, " N"], other: Int[np.ndarray, " N"]) -> Float[np.ndarray, " C"]:
+def change_delays(
+    reference: Int[np.ndarray, " N"], other: Int[np.ndarray, " N"], longest: float
+) -> Float[np.ndarray, " C"]:
     """For every change of the reference state, how much later the other one enters the same state [frames].
 
-    Of several such entries the nearest counts. NaN where there is none.
+    Of several such entries the nearest counts. NaN where there is none within `longest` frames.
     """
     begins = entries(other)
     delays = []
     for change in entries(reference)[1:]:
         same = begins[other[begins] == reference[change]]
         delays.append(same[np.abs(same - change).argmin()] - change if len(same) else np.nan)
-    return np.array(delays, dtype=np.float64)
+    result = np.array(delays, dtype=np.float64)
+    result[np.abs(result) > longest] = np.nan
+    return result
 
 
 def normalised_mutual_information(first: Int[np.ndarray, " N"], second: Int[np.ndarray, " N"]) -> float:
@@ -156,7 +165,7 @@ def segmentation(passes: Sequence[Pass]) -> Segmentation:
         seconds += counts / one.trial.rate
         visits += np.bincount(one.active[entries(one.active)], minlength=n_states)
     probability = np.exp(np.concatenate([one.log_alpha for one in passes]))
-    delays = [change_delays(one.active_joint, one.active) for one in passes]
+    delays = [change_delays(one.active_joint, one.active, LONGEST_DELAY * one.trial.rate) for one in passes]
     matched = np.isfinite(np.concatenate(delays))
     n_windows = int(steps.sum())
     return Segmentation(

@@ -54,17 +54,19 @@ SMOOTHING = 0.3
 def error_curves(group: Comparison) -> str:
     """Error over time of every action: the best variant beside baselines; line: median of trials, band: their range."""
     with _style():
-        figure, axes = _grid(len(group.actions), 2.25)
+        figure, axes = _grid(len(group.actions), 2.3)
         for ax, action in zip(axes, group.actions, strict=True):
             rate = group.best.passes[action][0].trial.rate
             for name, (color, dashes) in LINES.items():
                 _curve(ax, group.baselines[name][action], rate, color, dashes, name)
             _curve(ax, [one.errors for one in group.best.passes[action]], rate, MODEL_COLOR, "-", group.best.label)
             ax.set_title(action)
-            ax.set_ylim(bottom=0.0)
+            ax.set_yscale("log")  # errors of one trial span three orders of magnitude
+            ax.yaxis.set_major_formatter(lambda value, position: f"{value:g}")
+            ax.yaxis.grid(True, color="#e6e8eb", linewidth=0.6)
             ax.set_xlim(left=0.0)
             ax.set_xlabel("time [s]")
-        axes[0].set_ylabel("squared error [m² × 100]" if group.human_human else "squared error [rad²]")
+            ax.set_ylabel("error [m² × 100]" if group.human_human else "error [rad²]")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles[::-1], labels[::-1], loc="outside upper right", ncols=3, frameon=False)
         return _svg(figure)
@@ -108,10 +110,12 @@ def _latent(
     dimensions: slice,
 ) -> None:
     from matplotlib.patches import Ellipse
+    from matplotlib.patheffects import withStroke
 
+    halo = [withStroke(linewidth=2.5, foreground="white")]
     hmm = passes[0].hmm.marginal(dimensions)
-    finite = np.concatenate([track[np.isfinite(track).all(1)] for track in tracks])
-    mean, plane, share = principal_plane(np.concatenate([finite, hmm.emission_means]))
+    finite = np.concatenate([track[np.isfinite(track).all(1)] for track in (*tracks, *truths)])
+    mean, plane, share = principal_plane(finite)
     for truth in truths:
         x, y = ((truth - mean) @ plane.T).T
         ax.plot(x, y, color="#c2c6cc", linewidth=0.8, zorder=1)
@@ -129,7 +133,9 @@ def _latent(
         color = state_color(state)
         ax.add_patch(Ellipse(tuple(center), width, height, angle=angle, facecolor=color, alpha=0.16, zorder=3))
         ax.add_patch(Ellipse(tuple(center), width, height, angle=angle, fill=False, edgecolor=color, lw=1.2, zorder=3))
-        ax.text(*center, str(state), ha="center", va="center", fontsize=9, fontweight="bold", zorder=4)
+        ax.text(
+            *center, str(state), ha="center", va="center", fontsize=9, fontweight="bold", zorder=4, path_effects=halo
+        )
     ax.autoscale_view()
     ax.set_title(title)
     ax.set_xlabel(f"1st component ({share[0]:.0%} of variance)")
@@ -146,7 +152,8 @@ def _curve(ax: Axes, errors: Sequence[Float[np.ndarray, " _"]], rate: float, col
     seen = np.isfinite(table).any(0)
     time = np.flatnonzero(seen) / rate
     table = table[:, seen]
-    ax.fill_between(time, np.nanmin(table, 0), np.nanmax(table, 0), color=color, alpha=0.13, linewidth=0)
+    if label != "constant":  # its band hides the others
+        ax.fill_between(time, np.nanmin(table, 0), np.nanmax(table, 0), color=color, alpha=0.13, linewidth=0)
     ax.plot(time, np.nanmedian(table, 0), color=color, linestyle=dashes, linewidth=1.4, label=label)
 
 
@@ -167,7 +174,7 @@ def _style():
 def _grid(n: int, height: float) -> tuple[Figure, Sequence[Axes]]:
     from matplotlib.figure import Figure
 
-    columns = min(n, 4)
+    columns = min(n, 2)
     rows = -(-n // columns)
     figure = Figure(figsize=(9.6, height * rows + 0.3), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()

@@ -32,6 +32,8 @@ class Headline:
     label: str
     value: str
     remark: str
+    row: str
+    """The name of its row in the table."""
 
 
 def report(checkpoints: Sequence[Path], dataset: str, out: Path) -> None:
@@ -68,8 +70,9 @@ def render(
         program=f"mild_viz {version('mild-viz')}, Python {platform.python_version()}, NumPy {version('numpy')}",
         groups=[_group(group) for group in groups],
         state_colors=[tables.state_color(state) for state in range(max(model.n_states for model in checkpoints))],
+        model_paths=[_shown(model.path) for model in checkpoints],
         commands=commands,
-        best_changed=[model.name for model in checkpoints if _data_changed(model, dataset)],
+        data_changed=[model.name for model in checkpoints if _data_changed(model, dataset)],
     )
 
 
@@ -84,12 +87,14 @@ def _group(group: Comparison) -> dict[str, Any]:
         "human_human": group.human_human,
         "best": best.label,
         "headlines": _headlines(group),
+        "verdict": _verdict(group),
         "warnings": _warnings(group),
         "notes": group.notes,
         "results": tables.results(group),
         "curves": Markup(figures.error_curves(group)),
         "curve_baselines": list(group.baselines),
         "strips": [(action, strips.trial_strips(best.passes[action])) for action in group.actions],
+        "truth_colors": strips.truth_colors([one for some in best.passes.values() for one in some]),
         "latents": [(action, Markup(figures.latent_plots(best, action))) for action in group.actions],
         "most_trials": figures.MOST_TRIALS,
         "states": tables.states(group),
@@ -113,8 +118,18 @@ def _headlines(group: Comparison) -> list[Headline]:
     ):
         if some:
             best = min(some, key=group.mean_error)
-            found.append(Headline(title, f"{group.mean_error(best):.3f}", best.removeprefix("paper ")))
+            found.append(Headline(title, f"{group.mean_error(best):.3f}", best.removeprefix("paper "), best))
     return found
+
+
+def _verdict(group: Comparison) -> str:
+    """In words, how the best variant stands."""
+    own, words = group.mean_error(group.best.label), []
+    for one in _headlines(group)[1:]:
+        ratio = own / float(group.mean_error(one.row))
+        far = f"{abs(ratio - 1):.0%} {'above' if ratio > 1 else 'below'}"
+        words.append(f"{far} that of {one.remark} ({one.label})")
+    return f"The error of {group.best.label} is {' and '.join(words)}." if words else ""
 
 
 def _warnings(group: Comparison) -> list[tuple[str, str, list[tuple[str, str]]]]:
@@ -137,6 +152,11 @@ def _merged(found: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     for label, text in found:
         texts.setdefault(text, []).append(label)
     return [(", ".join(labels), text) for text, labels in texts.items()]
+
+
+def _shown(path: Path) -> str:
+    """A path as it reads from the working folder, if it lies below: a reader elsewhere has no use for the rest."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
 def _data_changed(checkpoint: Checkpoint, dataset: Dataset) -> bool:

@@ -59,6 +59,15 @@ def trial_strips(passes: Sequence[Pass]) -> list[TrialStrips]:
     ]
 
 
+def truth_colors(passes: Sequence[Pass]) -> list[tuple[str, str]]:
+    """Legend of the strips that show the truth."""
+    if any(one.phase is not None for one in passes):
+        return list(zip(PHASES, PHASE_COLORS, strict=True))
+    if any(contact_frames(one.trial)[one.newest].any() for one in passes):
+        return [("hands touch", PHASE_COLORS[2])]
+    return []
+
+
 def _strips(one: Pass) -> list[Strip]:
     strips = [Strip("human-only α", _alpha(one, one.log_alpha)), Strip("joint α", _alpha(one, one.log_alpha_joint))]
     if one.phase is not None:

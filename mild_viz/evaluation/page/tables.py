@@ -22,9 +22,10 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Cell:
-    """A text; `best` marks the winner of a column, `share` (0 to 1) draws a bar below it."""
+    """A text and small lines below it; `best` marks the winner of a column, `share` (0 to 1) draws a bar below it."""
 
     text: str
+    note: str = ""
     best: bool = False
     share: float | None = None
     color: str = ""
@@ -60,7 +61,7 @@ def results(group: Comparison) -> Table:
     paper = [label for label in by_label if label not in ours]
     best = {a: min(by_label[m][a].mse_mean for m in ours if a in by_label[m]) for a in group.actions}
     means = {label: group.mean_error(label) for label in by_label}
-    best_mean, largest = min(means[label] for label in ours), max(means.values())
+    best_mean = min(means[label] for label in ours)
     lines = []
     for title, labels in (
         ("Models", models),
@@ -79,7 +80,12 @@ def results(group: Comparison) -> Table:
             mean = means[label]
             marked = label in ours and mean == best_mean
             cells.append(
-                Cell(_error(mean), best=marked, share=mean / largest, color="#0072B2" if label in models else "")
+                Cell(
+                    _error(mean),
+                    best=marked,
+                    share=min(1.0, mean / means["constant"]),
+                    color="#0072B2" if label in models else "",
+                )
             )
             lines.append(Line(label.removeprefix("paper "), cells, "paper" if label in paper else ""))
     counts = {row.action: f"{row.n_windows} windows, {row.n_trials} trials" for row in group.rows if row.n_windows}
@@ -99,7 +105,7 @@ def states(group: Comparison) -> list[Table]:
             for action in group.actions:
                 used = model.segmentation[action]
                 share, seconds = used.occupancy[state], used.duration[state]
-                cells.append(Cell(f"{share:.0%} · {seconds:.2f} s", share=share, color=state_color(state)))
+                cells.append(Cell(f"{share:.0%}", f"{seconds:.2f} s", share=share, color=state_color(state)))
             lines.append(Line(f"state {state}", cells))
         lines.append(Line("Per trial"))
         used = [model.segmentation[action] for action in group.actions]
@@ -117,8 +123,10 @@ def agreement(group: Comparison) -> Table:
         cells = []
         for action in group.actions:
             used = model.segmentation[action]
-            delay = NONE if used.delay is None else f"{used.delay_frames:+.1f} frames, {used.delay:+.2f} s"
-            cells.append(Cell(f"{used.agreement:.0%} · {delay}", share=used.agreement))
+            delay = f"{used.matched:.0%} matched"
+            if used.delay is not None and used.delay_frames is not None:
+                delay = f"{_signed(used.delay_frames, 1)} frames ({_signed(used.delay, 2)} s)\n{delay}"
+            cells.append(Cell(f"{used.agreement:.0%}", delay, share=used.agreement))
         lines.append(Line(model.label, cells))
     caption = "Windows with the same active state, and median delay of the human-only change of state"
     return Table(caption, group.actions, lines)
@@ -140,13 +148,16 @@ def phase_tables(group: Comparison) -> list[Table]:
                     Cell(NONE) if fit is None else Cell(f"{fit.nmi_joint:.2f}", share=fit.nmi_joint) for fit in own
                 ]
                 lines.append(Line(f"joint α, {other.label}", cells))
-        lines.append(Line("Delay of the boundary: median, median of absolute values [s] (found of all)"))
+        lines.append(Line("Delay of the boundary, median over trials"))
         for index, name in enumerate(BOUNDARIES):
             cells = []
             for fit in fits.values():
                 one = fit.boundaries[index]
-                delay = NONE if one.delay is None else f"{one.delay:+.2f}, {one.absolute:.2f}"
-                cells.append(Cell(f"{delay} ({one.n_found} of {one.n_true})"))
+                found = f"{one.n_found} of {one.n_true} found"
+                if one.delay is None or one.absolute is None:
+                    cells.append(Cell(NONE, found))
+                else:
+                    cells.append(Cell(f"{_signed(one.delay, 2)} s", f"absolute {one.absolute:.2f} s\n{found}"))
             lines.append(Line(name, cells))
         lines.append(Line("Phase that a state stands for"))
         mappings = []
@@ -155,33 +166,33 @@ def phase_tables(group: Comparison) -> list[Table]:
             for phase, name in enumerate(PHASES):
                 owned = [str(state) for state, of in enumerate(fit.phase_of_state) if of == phase]
                 parts.append(f"{name} {', '.join(owned) or NONE}")
-            mappings.append(Cell(" · ".join(parts)))
+            mappings.append(Cell("", "\n".join(parts)))
         lines.append(Line("states", mappings))
         tables.append(Table(f"Active state beside the true phases, {names}", list(fits), lines))
     return tables
 
 
-def calibrations(group: Comparison) -> Table:
-    """Coverage and energy scores, pooled over actions by windows, then of each action."""
+def calibrations(group: Comparison) -> list[Table]:
+    """Coverage and energy scores, pooled over actions by windows, and then of each action."""
     unit = "m" if group.human_human else "rad"
     what = "positions" if group.human_human else "joints"
-    lines = []
-    for action in (None, *group.actions):
-        lines.append(Line("all actions" if action is None else action))
-        for model in group.models:
-            some = [one for name, one in model.calibration.items() if one is not None and action in (None, name)]
-            lines.append(Line(model.label, _calibration_cells(some)))
     head = [
         *(f"{level:.0%} ellipsoid" for level in LEVELS), "energy score", "mean alone",
         *(f"{level:.0%} interval" for level in LEVELS), "energy score", "mean alone",
     ]  # fmt: skip
     small = [*["latent"] * 4, *[what] * 2, *[f"{what} [{unit}]"] * 2]
-    return Table(
-        "Coverage by the predictive covariance, and energy score beside the distance of the mean alone",
-        head,
-        lines,
-        small,
-    )
+    result = []
+    for title, actions in (("All actions", [None]), ("Each action", group.actions)):
+        lines = []
+        for action in actions:
+            if action is not None:
+                lines.append(Line(action))
+            for model in group.models:
+                some = [one for name, one in model.calibration.items() if one is not None and action in (None, name)]
+                lines.append(Line(model.label, _calibration_cells(some)))
+        caption = f"{title}: coverage by the predictive covariance; energy score beside the distance of the mean alone"
+        result.append(Table(caption, head, lines, small))
+    return result
 
 
 def _calibration_cells(some: Sequence[Calibration]) -> list[Cell]:
@@ -217,8 +228,11 @@ def hands(group: Comparison) -> Table | None:
         cells = []
         for action in group.actions:
             one = model.hands[action]
-            text = NONE if one is None else f"{one.mean:.3f} ± {one.std:.3f} (90 % below {one.worst:.3f})"
-            cells.append(Cell(text, best=one is not None and one.mean == best[action]))
+            if one is None:
+                cells.append(Cell(NONE))
+            else:
+                text, note = f"{one.mean:.3f} ± {one.std:.3f}", f"90 % below {one.worst:.3f}"
+                cells.append(Cell(text, note, best=one.mean == best[action]))
         lines.append(Line(model.label, cells))
     what = "the second human's wrist" if group.human_human else "the robot's hand by forward kinematics"
     return Table(f"Distance of {what}, predicted to true [m], mean ± standard deviation", group.actions, lines)
@@ -231,16 +245,17 @@ def contacts(group: Comparison) -> Table | None:
         return None
     lines = []
     for model in group.models:
-        for controller in COMPARED:
-            found = [model.contact[action] for action in actions]
-            cells = [Cell(NONE) if one is None else Cell(f"{one.controllers[controller]:.3f}") for one in found]
-            lines.append(Line(f"{model.label}, {controller}", cells))
+        found = [model.contact[action] for action in actions]
+        cells = [
+            Cell(NONE if one is None else " → ".join(f"{one.controllers[c]:.3f}" for c in COMPARED)) for one in found
+        ]
+        lines.append(Line(model.label, cells))
     found = [group.models[0].contact[action] for action in actions]
     cells = [Cell(NONE if one is None or one.truth is None else f"{one.truth:.3f}") for one in found]
     lines.append(Line("the true motion itself", cells, "paper"))
     counts = [NONE if one is None else f"{one.n_frames} frames" for one in found]
     return Table(
-        "Mean distance of the robot's hand from the human's, while the recorded partners touch [m]",
+        f"Distance of the robot's hand from the human's while the recorded partners touch [m]: {' → '.join(COMPARED)}",
         actions,
         lines,
         counts,
@@ -271,6 +286,12 @@ def _alike(models: Sequence[Measured]) -> list[tuple[str, Measured]]:
 
 def _labels(group: Comparison) -> list[str]:
     return list(dict.fromkeys(row.model for row in group.rows))
+
+
+def _signed(value: float, digits: int) -> str:
+    """With a sign, and a true minus; nothing before a zero."""
+    text = f"{value:+.{digits}f}".replace("-", "−")
+    return text if text.strip("+−0.") else text[1:]
 
 
 def _error(value: float) -> str:
