@@ -194,6 +194,6 @@ def _svg(figure: Figure) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'<(g|text) id="[\w.]+"', r"<\1", text)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)  # a page knows them by itself
-    text = re.sub(r"(\d+\.\d\d)\d+", r"\1", text)
+    text = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d+\.\d\d)\d+", r"\1", tag[0]), text)
     text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt" ', "", text, count=1)
     return re.sub(r"\n\s*", "\n", text).strip()

@@ -77,12 +77,13 @@ def compare(
     Raises:
         UserError: where the dataset does not fit a checkpoint.
     """
-    labels = _checkpoint_labels(checkpoints)
-    groups: dict[tuple[str, ...] | None, list[tuple[str, Checkpoint]]] = {}
-    for label, checkpoint in zip(labels, checkpoints, strict=True):
-        partner = checkpoint.robot.joint_names if checkpoint.robot else None
-        groups.setdefault(partner, []).append((label, checkpoint))
-    return [_comparison(group, dataset, advance) for group in groups.values()]
+    groups: dict[tuple[str, ...] | None, list[Checkpoint]] = {}
+    for checkpoint in checkpoints:
+        groups.setdefault(checkpoint.robot.joint_names if checkpoint.robot else None, []).append(checkpoint)
+    return [
+        _comparison(list(zip(_checkpoint_labels(group), group, strict=True)), dataset, advance)
+        for group in groups.values()
+    ]
 
 
 def _checkpoint_labels(checkpoints: Sequence[Checkpoint]) -> list[str]:

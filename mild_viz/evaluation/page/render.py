@@ -126,10 +126,9 @@ def _verdict(group: Comparison) -> str:
     """In words, how the best variant stands."""
     own, words = group.mean_error(group.best.label), []
     for one in _headlines(group)[1:]:
-        ratio = own / float(group.mean_error(one.row))
-        far = f"{abs(ratio - 1):.0%} {'above' if ratio > 1 else 'below'}"
-        words.append(f"{far} that of {one.remark} ({one.label})")
-    return f"The error of {group.best.label} is {' and '.join(words)}." if words else ""
+        ratio = own / group.mean_error(one.row)
+        words.append(f"{abs(ratio - 1):.0%} {'above' if ratio > 1 else 'below'} that of {one.remark}, the {one.label}")
+    return f"The error of {group.best.label} is {', and '.join(words)}." if words else ""
 
 
 def _warnings(group: Comparison) -> list[tuple[str, str, list[tuple[str, str]]]]:

@@ -111,7 +111,7 @@ def states(group: Comparison) -> list[Table]:
         used = [model.segmentation[action] for action in group.actions]
         lines.append(Line("changes of state", [Cell(f"{one.changes:.1f}") for one in used]))
         lines.append(Line("back-transitions", [Cell(f"{one.back_transitions:.1f}") for one in used]))
-        lines.append(Line("entropy of α / log S", [Cell(f"{one.entropy:.3f}") for one in used]))
+        lines.append(Line("entropy of α", [Cell(f"{one.entropy:.3f}") for one in used]))
         tables.append(Table(f"Share of time and mean length of a visit, {names}", group.actions, lines))
     return tables
 
@@ -232,7 +232,7 @@ def hands(group: Comparison) -> Table | None:
                 cells.append(Cell(NONE))
             else:
                 text, note = f"{one.mean:.3f} ± {one.std:.3f}", f"90 % below {one.worst:.3f}"
-                cells.append(Cell(text, note, best=one.mean == best[action]))
+                cells.append(Cell(text, note, best=len(group.models) > 1 and one.mean == best[action]))
         lines.append(Line(model.label, cells))
     what = "the second human's wrist" if group.human_human else "the robot's hand by forward kinematics"
     return Table(f"Distance of {what}, predicted to true [m], mean ± standard deviation", group.actions, lines)

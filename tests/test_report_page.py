@@ -1,0 +1,225 @@
+"""The report page: what it holds, that it stands alone, that names cannot break it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime, timezone
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mild_viz import cli
+from mild_viz.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from mild_viz.data import load
+from mild_viz.errors import UserError
+from mild_viz.evaluation.baselines import BASELINES
+from mild_viz.evaluation.page import report
+from mild_viz.evaluation.page.figures import principal_plane
+from mild_viz.evaluation.page.measure import compare
+from mild_viz.evaluation.page.render import render
+from mild_viz.paths import default_checkpoint
+from mild_viz.trial import Dataset
+
+HOSTILE = "<img src=x onerror=alert(1)> & $x$"
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class Page(HTMLParser):
+    """Collects what the tests look at, and that every element is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tables: list[list[list[str]]] = []
+        self.captions: list[str] = []
+        self.tags: dict[str, int] = {}
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] = self.tags.get(tag, 0) + 1
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src", "xlink:href", "action")]
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.handle_endtag(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" in self.open:
+            return
+        self.words.append(data)
+        if self.open and self.open[-1] in ("td", "th"):
+            self.tables[-1][-1][-1] += data.strip()
+        elif "caption" in self.open:
+            self.captions.append(data)
+
+    def column(self, table: int) -> list[str]:
+        """The first column of a table."""
+        return [line[0] for line in self.tables[table]]
+
+
+@pytest.fixture(scope="module")
+def small() -> Dataset:
+    """Two training trials and one test trial of each action of the demo set."""
+    source = load.load_dataset("demo")
+    return replace(
+        source,
+        train=tuple(next_of(source.train, action, 2) for action in source.actions for next_of in (first, second)),
+        test=tuple(first(source.test, action, 1) for action in source.actions),
+    )
+
+
+def first(trials, action: str, _: int):
+    return next(trial for trial in trials if trial.action == action)
+
+
+def second(trials, action: str, _: int):
+    return [trial for trial in trials if trial.action == action][1]
+
+
+@pytest.fixture()
+def small_demo(small: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The demo set stands for few trials: the page has the same parts, in a fraction of the time."""
+    monkeypatch.setattr("mild_viz.evaluation.page.render.load_dataset", lambda name: small)
+    yield
+
+
+def human_human(checkpoint: Checkpoint) -> Checkpoint:
+    return replace(checkpoint, robot=None, robot_vaes={}, name="people", contact_states={}, placement=None)
+
+
+def test_the_page_holds_all_parts_and_stands_alone(
+    small_demo: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demo.html"
+    assert cli.main(["report", "--dataset", "demo", "--out", str(out)]) == 0
+    assert "open it in a browser" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["demo.html"]
+    text = out.read_text(encoding="utf-8")
+    model = load_checkpoint(default_checkpoint("demo"))
+    page = Page(text)
+    assert set(page.column(0)) >= {*model.variants, *BASELINES}
+    for caption in ("Mean squared error", "true phases", "same active state", "Coverage", "hand by forward", "touch"):
+        assert any(caption in some for some in page.captions), caption
+    for variant in model.variants:
+        assert sum(variant in page.column(table) for table in range(len(page.tables))) >= 5
+    assert page.tags["svg"] >= 1 + len(model.actions) + 3 * 4  # curves, latents, three strips of each test trial
+    words = " ".join("".join(page.words).split())
+    for part in (
+        model.dataset_checksum,
+        "Read this first",
+        str(model.training["command"]),
+        f"mild-viz report --dataset demo --out {out}",
+        "demo/test/4",
+    ):
+        assert part in words, part
+    assert page.addresses and all(address.startswith("#") for address in page.addresses)
+    assert not re.search(r"https?:|url\((?!#)|@import|<script|<link|<iframe", text)
+    assert len(text) < 3e6
+
+
+def test_names_are_shown_as_they_are(small: Dataset) -> None:
+    model = load_checkpoint(default_checkpoint("demo"))
+    variants = dict.fromkeys(model.variants[-1:])
+    hostile = [
+        replace(model, name=HOSTILE + end, robot_vaes={name: model.robot_vaes[name] for name in variants})
+        for end in ("1", "2")
+    ]
+    source = replace(small, title=HOSTILE, test=small.test[:1])
+    commands = [(f"mild-viz {HOSTILE}", "this page")]
+    text = render(compare(hostile, source), hostile, source, commands, datetime(2026, 1, 2, tzinfo=timezone.utc))
+    page = Page(text)
+    assert "img" not in page.tags and "<img" not in text
+    words = "".join(page.words)
+    assert words.count(HOSTILE) > 10
+    assert f"{HOSTILE}1 {model.variants[-1]}" in page.column(0)
+    assert "2026-01-02 00:00 UTC" in words
+
+
+def test_a_human_human_model_has_a_page(small_demo: None, tmp_path: Path) -> None:
+    people = save_checkpoint(human_human(load_checkpoint(default_checkpoint("demo"))), tmp_path / "people", "people")
+    out = tmp_path / "both.html"
+    report([people.path, default_checkpoint("demo")], "demo", out)
+    page = Page(out.read_text(encoding="utf-8"))
+    captions = " ".join(page.captions)
+    assert "m² × 100" in captions and "rad²" in captions
+    assert "second human's wrist" in captions and "hand by forward kinematics" in captions
+    assert sum("touch" in caption for caption in page.captions) == 1  # of the robot alone
+    assert "Human to second human" in "".join(page.words)
+
+
+def test_a_robot_without_description_leaves_distances_out(small: Dataset) -> None:
+    model = load_checkpoint(default_checkpoint("demo"))
+    assert model.robot is not None
+    other = replace(model, robot=replace(model.robot, name="unheard-of"))
+    (group,) = compare([other], replace(small, test=small.test[:1]))
+    assert "unheard-of" in group.notes[0]
+    assert set(group.models[0].hands.values()) == {None}
+
+
+def test_a_failing_write_leaves_the_old_page(
+    small_demo: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    out.write_text("old")
+
+    def full_disk(self: Path, *args: object, **kwargs: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mild_viz.evaluation.page.render.compare", lambda *args: [])
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    assert cli.main(["report", "--out", str(out)]) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert out.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("--out {tmp}/a.pdf", "must end in .html"),
+        ("--out {tmp}/none/a.html", "there is no folder"),
+        ("--dataset nothing --out {tmp}/a.html", "no model ships for dataset 'nothing'"),
+        ("--checkpoint {tmp}/none --out {tmp}/a.html", "is not a checkpoint"),
+    ],
+)
+def test_unusable_input_is_refused(
+    arguments: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["report", *arguments.format(tmp=tmp_path).split()]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_does_not_know_the_actions_is_refused(small: Dataset) -> None:
+    model = load_checkpoint(default_checkpoint("demo"))
+    narrow = replace(model, hmms={"wave": model.hmms["wave"]})
+    with pytest.raises(UserError, match="handshake"):
+        compare([narrow], small)
+
+
+def test_the_principal_plane_is_that_of_the_largest_variance() -> None:
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(5, 5)))[0]
+    points = rng.normal(size=(4000, 5)) * (3.0, 2.0, 0.1, 0.1, 0.1) @ basis.T + 7.0
+    mean, plane, share = principal_plane(points)
+    np.testing.assert_allclose(mean, points.mean(0))
+    np.testing.assert_allclose(np.abs(plane @ basis[:, :2]), np.eye(2), atol=0.05)
+    np.testing.assert_allclose(share, np.array([9.0, 4.0]) / 13.03, atol=0.03)
