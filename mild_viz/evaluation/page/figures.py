@@ -124,7 +124,7 @@ def _latent(
         starts = entries(one.active)
         for start, end in zip(starts, [*starts[1:], len(x)], strict=True):
             run = slice(start, end + 1)  # to the first point of the next run: the line has no gaps
-            ax.plot(x[run], y[run], color=state_color(one.active[start]), linewidth=0.9, alpha=0.8, zorder=2)
+            ax.plot(x[run], y[run], color=state_color(int(one.active[start])), linewidth=0.9, alpha=0.8, zorder=2)
     for state in range(hmm.n_states):
         center = plane @ (hmm.emission_means[state] - mean)
         values, vectors = np.linalg.eigh(plane @ hmm.emission_covariances[state] @ plane.T)

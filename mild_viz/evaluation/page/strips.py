@@ -82,7 +82,9 @@ def _strips(one: Pass) -> list[Strip]:
 def _alpha(one: Pass, log_alpha: np.ndarray) -> list[Run]:
     states, certain = log_alpha.argmax(1), np.exp(log_alpha.max(1))
     level = sum((certain < threshold).astype(int) for threshold in CERTAINTY)
-    looks = [(f"state {state}", state_color(state), OPACITY[step]) for state, step in zip(states, level, strict=True)]
+    looks = [
+        (f"state {state}", state_color(int(state)), OPACITY[step]) for state, step in zip(states, level, strict=True)
+    ]
     return _runs(states * len(OPACITY) + level, looks, one.trial.rate)
 
 
