@@ -82,8 +82,7 @@ def _summaries(dataset: str, model: str, data: Windows, predicted: np.ndarray, h
     return rows
 
 
-def examples_of(data: Windows, action: str) -> Examples:
-    """The complete windows of one action. Raises `UserError` where there is none."""
+def _examples(data: Windows, action: str) -> Examples:
     of_action = np.array([of == action for of in data.actions])[data.trial]
     keep = of_action & data.complete
     if not keep.any():
@@ -96,8 +95,8 @@ def baseline_rows(dataset: str, train: Windows, test: Windows, human_human: bool
     rows = []
     for name, fit in BASELINES.items():
         for action in dict.fromkeys(test.actions):
-            predictor = fit(examples_of(train, action))
-            examples = examples_of(test, action)
+            predictor = fit(_examples(train, action))
+            examples = _examples(test, action)
             errors = window_errors(predictor(examples), examples.partner, human_human)
             n_trials = sum(of == action for of in test.actions)
             rows.append(Row(dataset, name, action, float(errors.mean()), float(errors.std()), len(errors), n_trials))
