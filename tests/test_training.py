@@ -19,7 +19,7 @@ from mild_viz.latent.hmm import unobserved_forward
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import VARIANTS
+from mild_viz.settings import PAPER_VARIANTS
 from mild_viz.training import run as training_run
 from mild_viz.training.human_stage import HumanModel, complete_rows, prior_states, train_human_stage
 from mild_viz.training.networks import BatchedVAE, gaussian_kl, standard_kl
@@ -95,16 +95,16 @@ def test_training_samples_have_the_papers_distribution(
     humans: list[HumanModel], human_data: Windows, variant: str
 ) -> None:
     data = complete_rows(human_data)
-    centre, factor = conditional_factors(humans[0], data, VARIANTS[variant])
+    centre, factor = conditional_factors(humans[0], data, PAPER_VARIANTS[variant])
     row = 200
     trial, step = int(data.trial[row]), int(data.step[row])
     hmm = humans[0].hmms[data.actions[trial]]
     log_alpha = unobserved_forward(hmm, step + 1)[step:]
     mean, std = humans[0].vae.encode(data.human[row : row + 1])
-    posterior = std if VARIANTS[variant].posterior_covariance else None
+    posterior = std if PAPER_VARIANTS[variant].posterior_covariance else None
     expected, covariance = condition(hmm, mean, log_alpha, posterior)
     np.testing.assert_allclose(centre[row], expected[0], atol=1e-10)
-    if VARIANTS[variant].conditional_training == "conditional-samples":
+    if PAPER_VARIANTS[variant].conditional_training == "conditional-samples":
         np.testing.assert_allclose(factor[row] @ factor[row].T, covariance[0], atol=1e-5)
     else:  # conditioned samples of the posterior, by brute force
         eps = np.random.default_rng(0).normal(size=(50, 5))
@@ -132,7 +132,7 @@ def test_conditional_training_lowers_the_error_of_conditioned_predictions(
     robots = train_robot_stage(data, humans, ("v1", "v3.1"), options, silent)
     usable = complete_rows(data)
     for human, robot in zip(humans, robots, strict=True):
-        centre, _ = conditional_factors(human, usable, VARIANTS["v3.1"])
+        centre, _ = conditional_factors(human, usable, PAPER_VARIANTS["v3.1"])
         errors = {name: ((vae.decode(centre) - usable.partner) ** 2).mean() for name, vae in robot.items()}
         constant = ((usable.partner.mean(0) - usable.partner) ** 2).mean()
         assert errors["v3.1"] < constant and errors["v3.1"] < errors["v1"]
@@ -194,7 +194,7 @@ def test_the_seed_is_chosen_by_held_out_error() -> None:
     held = hold_out(load_dataset("demo").train, 1)[1]
     candidates = [random_checkpoint(seed) for seed in range(3)]
     best, scores = choose_seed(candidates, held)
-    means = [np.mean([score[v] for v in VARIANTS if v != "v1"]) for score in scores]
+    means = [np.mean([score[v] for v in PAPER_VARIANTS if v != "v1"]) for score in scores]
     assert best == int(np.argmin(means)) and len(scores) == 3
 
 
@@ -251,7 +251,7 @@ def test_a_damaged_state_is_named(tmp_path: Path) -> None:
 def test_a_diverged_seed_is_never_chosen() -> None:
     held = hold_out(load_dataset("demo").train, 1)[1]
     good = random_checkpoint(0)
-    weights = {name: np.full_like(value, np.nan) for name, value in good.robot_vae("v3.1").weights.items()}
+    weights = {name: np.full_like(value, np.nan) for name, value in good.members("v3.1")[0].robot_vae.weights.items()}
     broken = replace(good, robot_vaes={**good.robot_vaes, "v3.1": VAE(weights)})
     assert choose_seed([broken, good], held)[0] == 1
     with pytest.raises(UserError, match="every seed diverged"):
