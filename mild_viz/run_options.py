@@ -25,6 +25,8 @@ SplitName = Literal["train", "test"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+OptionalPaths = Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="")]
+OptionalNames = Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
     VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
