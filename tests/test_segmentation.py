@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mild_viz.checkpoint import load_checkpoint
@@ -35,6 +35,7 @@ def test_mutual_information_of_known_partitions() -> None:
     assert normalised_mutual_information(a, np.array([0, 1, 2, 2])) == pytest.approx(2 / 2.5)
 
 
+@settings(deadline=None)  # the first example pays for an import
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 4)), min_size=2, max_size=40))
 def test_mutual_information_is_that_of_scikit_learn(pairs: list[tuple[int, int]]) -> None:
     from sklearn.metrics import normalized_mutual_info_score
@@ -53,11 +54,11 @@ def test_back_transitions_are_counted() -> None:
 def test_a_change_is_compared_with_the_nearest_entry_into_the_same_state() -> None:
     reference = np.array([0] * 10 + [1] * 10 + [2] * 10)
     other = np.array([0] * 13 + [1] * 5 + [2] * 12)
-    np.testing.assert_array_equal(change_delays(reference, other, 10), [3, -2])
-    np.testing.assert_array_equal(change_delays(reference, other, 2), [np.nan, -2])
+    np.testing.assert_array_equal(change_delays(reference, other, 10.0), [3, -2])
+    np.testing.assert_array_equal(change_delays(reference, other, 2.0), [np.nan, -2])
     flickering = np.array([0] * 4 + [1] * 2 + [0] * 5 + [1] * 9 + [0] * 10)
-    np.testing.assert_array_equal(change_delays(reference, flickering, 10), [1, np.nan])
-    assert len(change_delays(np.zeros(5, int), reference, 10)) == 0
+    np.testing.assert_array_equal(change_delays(reference, flickering, 10.0), [1, np.nan])
+    assert len(change_delays(np.zeros(30, int), reference, 10.0)) == 0
 
 
 def test_states_stand_for_the_phase_they_are_mostly_in() -> None:
@@ -110,7 +111,7 @@ def test_phases_are_learnt_on_training_and_measured_on_test_trials() -> None:
     assert [one.absolute for one in fit.boundaries] == pytest.approx([0.0, 0.3, 0.2, 0.0])
     assert {(one.n_found, one.n_true) for one in fit.boundaries} == {(1, 1)}
     perfect = phase_fit([train], [train])
-    assert perfect is not None and perfect.nmi == pytest.approx(1.0) > fit.nmi
+    assert perfect is not None and perfect.nmi == pytest.approx(1.0) and fit.nmi < 0.9
     idle = phase_fit([train], [make_pass([0] * 30, phase=phase)])
     assert idle is not None and idle.nmi == 0.0
     assert [(one.delay, one.n_found, one.n_true) for one in idle.boundaries] == [(None, 0, 1)] * 4

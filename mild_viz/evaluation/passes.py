@@ -4,29 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mild_viz.checkpoint import Checkpoint
-from mild_viz.evaluation.metrics import window_errors
-from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows
+from mild_viz.evaluation.metrics import joint_names, window_errors
+from mild_viz.latent.hmm import HMM
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import stack_windows
-from mild_viz.settings import VARIANTS, WINDOW
+from mild_viz.pipeline import joint_log_alpha
+from mild_viz.prediction import predict
+from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
-
-
-class Prediction(NamedTuple):
-    """What a model says about N human windows."""
-
-    human_mean: Float[np.ndarray, "N D"]
-    log_alpha: Float[np.ndarray, "N S"]
-    robot_mean: Float[np.ndarray, "N D"]
-    robot_covariance: Float[np.ndarray, "N D D"]
-    decoded: Float[np.ndarray, "N Y"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,59 +75,38 @@ class Pass:
         return windows[:, : features // 2 if self.human_human else features]
 
 
-def variants_of(checkpoint: Checkpoint) -> tuple[str, ...]:
-    """The variants that a checkpoint can be measured in; the human-human model is v1."""
-    return checkpoint.variants or ("v1",)
-
-
 def run_passes(checkpoint: Checkpoint, variant: str, trials: Sequence[Trial]) -> list[Pass]:
-    """Every trial under one variant. Raises `UserError` where a trial does not fit the model."""
+    """Every trial under one variant; states and latents are those of its first model, predictions the average of all.
+
+    Raises:
+        UserError: where a trial does not fit the model.
+    """
+    if not trials:
+        return []
     human_human = checkpoint.robot is None
-    data = stack_windows(trials, checkpoint.robot.joint_names if checkpoint.robot else None)
-    decoder = checkpoint.human_vae if human_human else checkpoint.robot_vae(variant)
+    data = stack_windows(trials, joint_names(checkpoint))
+    model = checkpoint.members(variant)[0]
     passes = []
     for index, trial in enumerate(trials):
-        human, partner = data.human[data.rows(index)], data.partner[data.rows(index)]
-        hmm = checkpoint.hmm(trial.action)
-        said = _predict(checkpoint, variant, trial.action, human)
-        truth, _ = decoder.encode(partner)
-        errors = window_errors(said.decoded, partner, human_human)
+        rows = data.rows(index)
+        said = predict(checkpoint, variant, trial.action, data.human[rows])
+        partner = data.partner[rows]
+        truth, _ = model.robot_vae.encode(partner)
         passes.append(
             Pass(
                 trial=trial,
                 human_human=human_human,
-                hmm=hmm,
-                partner_vae=decoder,
+                hmm=model.hmms[trial.action],
+                partner_vae=model.robot_vae,
                 log_alpha=said.log_alpha,
-                log_alpha_joint=_joint_alpha(hmm, said.human_mean, truth),
+                log_alpha_joint=joint_log_alpha(model, trial.action, said.human_mean, truth),
                 human_mean=said.human_mean,
                 partner_mean=said.robot_mean,
                 partner_covariance=said.robot_covariance,
                 partner_truth=truth,
                 predicted=said.decoded,
                 truth=partner,
-                errors=np.where(data.complete[data.rows(index)], errors, np.nan),
+                errors=np.where(data.complete[rows], window_errors(said.decoded, partner, human_human), np.nan),
             )
         )
     return passes
-
-
-def _predict(checkpoint: Checkpoint, variant: str, action: str, human: Float[np.ndarray, "N X"]) -> Prediction:
-    hmm = checkpoint.hmm(action)
-    decoder = checkpoint.human_vae if checkpoint.robot is None else checkpoint.robot_vae(variant)
-    mean, std = checkpoint.human_vae.encode(human)
-    human_hmm = hmm.marginal(slice(0, mean.shape[1]))
-    log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean))
-    posterior = std if VARIANTS[variant].posterior_covariance else None
-    robot_mean, robot_covariance = condition(hmm, mean, log_alpha, posterior)
-    return Prediction(mean, log_alpha, robot_mean, robot_covariance, decoder.decode(robot_mean))
-
-
-def _joint_alpha(
-    hmm: HMM, human_mean: Float[np.ndarray, "N D"], partner_truth: Float[np.ndarray, "N D"]
-) -> Float[np.ndarray, "N S"]:
-    """The forward variable given both partners; where the partner was lost, the human alone still says something."""
-    human_hmm = hmm.marginal(slice(0, human_mean.shape[1]))
-    both = np.concatenate([human_mean, partner_truth], axis=1)
-    seen = observed_rows(both)[:, None]
-    return forward_filter(hmm, np.where(seen, log_emission(hmm, both), log_emission(human_hmm, human_mean)))[0]

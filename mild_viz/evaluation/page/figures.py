@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from mild_viz.evaluation.page.measure import Comparison, Measured
+from mild_viz.evaluation.page.measure import Group, Result
 from mild_viz.evaluation.page.tables import state_color
 from mild_viz.evaluation.passes import Pass
 from mild_viz.evaluation.segmentation import entries
@@ -51,7 +51,7 @@ SMOOTHING = 0.3
 """Curves are means over this much time [s]."""
 
 
-def error_curves(group: Comparison) -> str:
+def error_curves(group: Group) -> str:
     """Error over time of every action: the best variant beside baselines; line: median of trials, band: their range."""
     with _style():
         figure, axes = _grid(len(group.actions), 2.3)
@@ -72,7 +72,7 @@ def error_curves(group: Comparison) -> str:
         return _svg(figure)
 
 
-def latent_plots(model: Measured, action: str) -> str:
+def latent_plots(model: Result, action: str) -> str:
     """Human and partner latents of an action's test trials in the plane of their largest variance, with the states.
 
     Lines have the colour of the active state; the recorded partner, encoded, is drawn in grey. An ellipse holds the

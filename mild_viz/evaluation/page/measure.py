@@ -1,4 +1,4 @@
-"""Everything that the page shows, measured once: one `Measured` a variant, one `Comparison` a kind of partner."""
+"""Everything that the page shows, measured once: a `Result` for each variant, a `Group` for each kind of partner."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.evaluation import health
-from mild_viz.evaluation.baselines import BASELINES
 from mild_viz.evaluation.calibration import Calibration, calibration
 from mild_viz.evaluation.distances import ContactDistance, HandError, contact_distance, hand_error
-from mild_viz.evaluation.metrics import Row, evaluation_rows, examples_of, model_rows, window_errors
-from mild_viz.evaluation.passes import Pass, run_passes, variants_of
+from mild_viz.evaluation.metrics import Row, joint_names
+from mild_viz.evaluation.passes import Pass, run_passes
+from mild_viz.evaluation.report import Evaluation, measure
 from mild_viz.evaluation.segmentation import PhaseFit, Segmentation, phase_fit, segmentation
 from mild_viz.pairs import stack_windows
 from mild_viz.robot.model import RobotModel, load_robot
@@ -24,15 +24,15 @@ SEED = 0
 """Of the samples that the energy scores are taken on."""
 
 CURVES = ("constant", "ridge")
-"""Baselines whose error is drawn over time, beside the best model's."""
+"""Baselines whose error is drawn over time, beside the best variant's."""
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Result:
     """One variant of one checkpoint on the test trials. Mappings are by action."""
 
     label: str
-    """The variant, with the checkpoint's name where there are several."""
+    """The variant, and of several checkpoints which one."""
     checkpoint: Checkpoint
     variant: str
     passes: Mapping[str, Sequence[Pass]]
@@ -45,97 +45,95 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Group:
     """Checkpoints that predict the same partner, and can stand in one table."""
 
-    human_human: bool
-    actions: tuple[str, ...]
-    rows: Sequence[Row]
-    models: Sequence[Measured]
+    evaluation: Evaluation
+    rows: Mapping[str, Mapping[str, Row]]
+    """By label and action: variants, baselines, the paper's."""
+    models: Sequence[Result]
     baselines: Mapping[str, Mapping[str, Sequence[np.ndarray]]]
     """Of each of `CURVES`, per action: the errors of every test trial's windows; NaN where incomplete."""
     notes: Sequence[str]
     """What could not be measured, and why."""
 
     @property
-    def best(self) -> Measured:
+    def actions(self) -> tuple[str, ...]:
+        """Those of the test trials."""
+        return tuple(self.models[0].passes)
+
+    @property
+    def human_human(self) -> bool:
+        return self.models[0].checkpoint.robot is None
+
+    @property
+    def best(self) -> Result:
         """The variant with the smallest mean error over actions."""
         return min(self.models, key=lambda model: self.mean_error(model.label))
 
     def mean_error(self, label: str) -> float:
         """Mean over actions of a row's error."""
-        return float(np.mean([row.mse_mean for row in self.rows if row.model == label]))
+        return float(np.mean([row.mse_mean for row in self.rows[label].values()]))
 
 
-def compare(
+def measure_groups(
     checkpoints: Sequence[Checkpoint], dataset: Dataset, advance: Callable[[str], object] = lambda label: None
-) -> list[Comparison]:
-    """Measure all variants of all checkpoints; one comparison for each kind of partner that they predict.
+) -> list[Group]:
+    """Measure all variants of all checkpoints; one group for each kind of partner that they predict.
 
-    `advance` is called with each model's label when it is measured.
+    `advance` is called with each variant's label when it is measured.
 
     Raises:
         UserError: where the dataset does not fit a checkpoint.
     """
     groups: dict[tuple[str, ...] | None, list[Checkpoint]] = {}
     for checkpoint in checkpoints:
-        groups.setdefault(checkpoint.robot.joint_names if checkpoint.robot else None, []).append(checkpoint)
-    return [
-        _comparison(list(zip(_checkpoint_labels(group), group, strict=True)), dataset, advance)
-        for group in groups.values()
-    ]
+        if missing := [action for action in dataset.actions if action not in checkpoint.actions]:
+            raise UserError(
+                f"checkpoint {checkpoint.name} does not know {', '.join(missing)} of {dataset.name}; "
+                f"it knows: {', '.join(checkpoint.actions)}"
+            )
+        groups.setdefault(joint_names(checkpoint), []).append(checkpoint)
+    return [_measure_group(group, dataset, advance) for group in groups.values()]
 
 
-def _checkpoint_labels(checkpoints: Sequence[Checkpoint]) -> list[str]:
-    """What stands before a variant: nothing for one checkpoint, names where they differ, else folders."""
-    if len(checkpoints) == 1:
-        return [""]
-    names = [checkpoint.name for checkpoint in checkpoints]
-    distinct = names if len(set(names)) == len(names) else [str(checkpoint.path) for checkpoint in checkpoints]
-    return [f"{name} " for name in distinct]
-
-
-def _comparison(
-    group: Sequence[tuple[str, Checkpoint]], dataset: Dataset, advance: Callable[[str], object]
-) -> Comparison:
-    first = group[0][1]
-    human_human = first.robot is None
-    rows: dict[tuple[str, str], Row] = {}
-    for prefix, checkpoint in group:
-        # Baselines and the paper's rows are the same for all of a group.
-        own = evaluation_rows(checkpoint, dataset) if checkpoint is first else model_rows(checkpoint, dataset.test)
-        for row in own:
-            model = f"{prefix}{row.model}" if row.model in variants_of(checkpoint) else row.model
-            rows[model, row.action] = Row(**{**row.as_dict(), "model": model})
+def _measure_group(group: Sequence[Checkpoint], dataset: Dataset, advance: Callable[[str], object]) -> Group:
+    names = [checkpoint.name for checkpoint in group]
+    if len(set(names)) < len(names):
+        names = [str(checkpoint.path) for checkpoint in group]
+    evaluation = measure(dict(zip(names, group, strict=True)), dataset)
+    rows: dict[str, dict[str, Row]] = {}
+    for row in evaluation.rows:
+        rows.setdefault(_label(row.model, row.checkpoint), {})[row.action] = row
     models, notes = [], []
-    for prefix, checkpoint in group:
+    for name, checkpoint in zip(names, group, strict=True):
         robot = None
         if checkpoint.robot is not None:
             try:
                 robot = load_robot(checkpoint.robot.name, checkpoint.robot.joint_names, checkpoint.robot.end_effector)
             except UserError as error:
-                notes.append(f"{checkpoint.name}: no distances in metres, since the {error}")
-        for variant in variants_of(checkpoint):
-            label = f"{prefix}{variant}"
-            models.append(_measure(label, checkpoint, variant, dataset, robot, rows))
+                notes.append(f"{checkpoint.name}: no distances in metres. {error}")
+        for variant in checkpoint.variants:
+            label = _label(variant, name if len(names) > 1 else None)
+            models.append(_measure_variant(label, checkpoint, variant, dataset, robot, rows))
             advance(label)
-    actions = tuple(dict.fromkeys(trial.action for trial in dataset.test))
-    # Models first, in the order given, as in the table of `mild-viz evaluate`.
-    labels = {model.label: None for model in models} | {row.model: None for row in rows.values()}
-    ordered = [rows[label, action] for label in labels for action in actions if (label, action) in rows]
-    return Comparison(human_human, actions, ordered, models, _baseline_errors(first, dataset), notes)
+    return Group(evaluation, rows, models, _baseline_errors(evaluation, joint_names(group[0])), notes)
 
 
-def _measure(
+def _label(model: str, checkpoint: str | None) -> str:
+    return model if checkpoint is None else f"{model}@{checkpoint}"
+
+
+def _measure_variant(
     label: str,
     checkpoint: Checkpoint,
     variant: str,
     dataset: Dataset,
     robot: RobotModel | None,
-    rows: Mapping[tuple[str, str], Row],
-) -> Measured:
+    rows: Mapping[str, Mapping[str, Row]],
+) -> Result:
     passes = _by_action(run_passes(checkpoint, variant, dataset.test))
-    training = _by_action(run_passes(checkpoint, variant, dataset.train)) if dataset.train else {}
+    training = _by_action(run_passes(checkpoint, variant, dataset.train))
     rng = np.random.default_rng(SEED)
     measured = {action: calibration(some, rng) for action, some in passes.items()}
     used = {action: segmentation(some) for action, some in passes.items()}
@@ -149,12 +147,11 @@ def _measure(
         warnings += health.misaligned(label, used[action])
         warnings += health.overconfident(label, action, one) if one else []
         if checkpoint.robot is not None:
-            contact_states = checkpoint.contact_states.get(action, frozenset())
-            warnings += health.without_contact_state(label, action, contact_states)
-        error, constant = rows[label, action].mse_mean, rows["constant", action].mse_mean
+            warnings += health.without_contact_state(label, action, checkpoint.contact_states_of(variant, action))
+        error, constant = rows[label][action].mse_mean, rows["constant"][action].mse_mean
         warnings += health.worse_than_constant(label, action, error, constant)
     can_measure = checkpoint.robot is None or robot is not None
-    return Measured(
+    return Result(
         label=label,
         checkpoint=checkpoint,
         variant=variant,
@@ -178,18 +175,14 @@ def _by_action(passes: Sequence[Pass]) -> dict[str, list[Pass]]:
     return result
 
 
-def _baseline_errors(checkpoint: Checkpoint, dataset: Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
-    joints = checkpoint.robot.joint_names if checkpoint.robot else None
-    train, test = stack_windows(dataset.train, joints), stack_windows(dataset.test, joints)
+def _baseline_errors(evaluation: Evaluation, joints: tuple[str, ...] | None) -> dict[str, dict[str, list[np.ndarray]]]:
+    """Put the errors of complete windows back to where in time they belong."""
+    test = stack_windows(evaluation.dataset.test, joints)
     result: dict[str, dict[str, list[np.ndarray]]] = {}
-    for name in CURVES:
-        errors = np.full(len(test.step), np.nan)
-        for action in dict.fromkeys(test.actions):
-            of_action = np.array([of == action for of in test.actions])[test.trial] & test.complete
-            shown = examples_of(test, action)
-            predicted = BASELINES[name](examples_of(train, action))(shown)
-            errors[of_action] = window_errors(predicted, shown.partner, checkpoint.robot is None)
-        result[name] = {}
-        for trial, action in enumerate(test.actions):
-            result[name].setdefault(action, []).append(errors[test.rows(trial)])
+    for measured in evaluation.measured:
+        if measured.model in CURVES:
+            errors = np.full(len(test.step), np.nan)
+            errors[test.complete] = measured.errors
+            for trial, action in enumerate(test.actions):
+                result.setdefault(measured.model, {}).setdefault(action, []).append(errors[test.rows(trial)])
     return result

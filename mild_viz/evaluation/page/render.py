@@ -16,8 +16,9 @@ from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.evaluation.baselines import BASELINES
 from mild_viz.evaluation.health import KINDS
+from mild_viz.evaluation.layout import comparison_table, runs_table
 from mild_viz.evaluation.page import figures, strips, tables
-from mild_viz.evaluation.page.measure import Comparison, compare
+from mild_viz.evaluation.page.measure import Group, measure_groups
 from mild_viz.files import write_atomically
 from mild_viz.trial import Dataset
 
@@ -45,13 +46,13 @@ def report(checkpoints: Sequence[Path], dataset: str, out: Path) -> None:
     folders = list(dict.fromkeys(checkpoints)) or [paths.default_checkpoint(dataset)]
     models = [load_checkpoint(folder) for folder in folders]
     source = load_dataset(dataset)
-    groups = compare(models, source, lambda label: print(f"measured {label}", flush=True))
+    groups = measure_groups(models, source, lambda label: print(f"measured {label}", flush=True))
     text = render(groups, models, source, _commands(models, source, checkpoints, out), datetime.now(timezone.utc))
     write_atomically(out, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def render(
-    groups: Sequence[Comparison],
+    groups: Sequence[Group],
     checkpoints: Sequence[Checkpoint],
     dataset: Dataset,
     commands: Sequence[tuple[str, str]],
@@ -76,7 +77,7 @@ def render(
     )
 
 
-def _group(group: Comparison) -> dict[str, Any]:
+def _group(group: Group) -> dict[str, Any]:
     """What the template needs of one comparison."""
     from markupsafe import Markup
 
@@ -91,12 +92,14 @@ def _group(group: Comparison) -> dict[str, Any]:
         "warnings": _warnings(group),
         "notes": group.notes,
         "results": tables.results(group),
+        "significance": _significance(group),
         "curves": Markup(figures.error_curves(group)),
         "curve_baselines": list(group.baselines),
         "strips": [(action, strips.trial_strips(best.passes[action])) for action in group.actions],
         "truth_colors": strips.truth_colors([one for some in best.passes.values() for one in some]),
         "latents": [(action, Markup(figures.latent_plots(best, action))) for action in group.actions],
-        "most_trials": figures.MOST_TRIALS,
+        "latent_trials": figures.MOST_TRIALS,
+        "largest": max(len(some) for some in best.passes.values()),
         "states": tables.states(group),
         "agreement": tables.agreement(group),
         "phases": tables.phase_tables(group),
@@ -106,9 +109,21 @@ def _group(group: Comparison) -> dict[str, Any]:
     }
 
 
-def _headlines(group: Comparison) -> list[Headline]:
+def _significance(group: Group) -> dict[str, Any]:
+    """Best and median over runs, differences over all actions, and of each action."""
+    evaluation = group.evaluation
+    unit = tables.unit(group)
+    runs = [
+        runs_table([one for one in evaluation.over_runs if one.source == source], unit)
+        for source in dict.fromkeys(one.source for one in evaluation.over_runs)
+    ]
+    pooled, single = (comparison_table(evaluation.comparisons, unit, each_action=each) for each in (False, True))
+    return {"runs": runs, "pooled": pooled, "single": single}
+
+
+def _headlines(group: Group) -> list[Headline]:
     """The best of our models, of the baselines and of the paper, by the mean over actions."""
-    labels = list(dict.fromkeys(row.model for row in group.rows))
+    labels = list(group.rows)
     models = [model.label for model in group.models]
     found = []
     for title, some in (
@@ -122,7 +137,7 @@ def _headlines(group: Comparison) -> list[Headline]:
     return found
 
 
-def _verdict(group: Comparison) -> str:
+def _verdict(group: Group) -> str:
     """In words, how the best variant stands."""
     own, words = group.mean_error(group.best.label), []
     for one in _headlines(group)[1:]:
@@ -131,7 +146,7 @@ def _verdict(group: Comparison) -> str:
     return f"The error of {group.best.label} is {', and '.join(words)}." if words else ""
 
 
-def _warnings(group: Comparison) -> list[tuple[str, str, list[tuple[str, str]]]]:
+def _warnings(group: Group) -> list[tuple[str, str, list[tuple[str, str]]]]:
     """Kind, what it means, and (model, actions with their figures) of all warnings, worst kind first."""
     result = []
     for kind, meaning in KINDS.items():

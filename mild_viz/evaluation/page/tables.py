@@ -11,7 +11,7 @@ import numpy as np
 from mild_viz.evaluation.baselines import BASELINES
 from mild_viz.evaluation.calibration import LEVELS, Calibration
 from mild_viz.evaluation.distances import COMPARED
-from mild_viz.evaluation.page.measure import Comparison, Measured
+from mild_viz.evaluation.page.measure import Group, Result
 from mild_viz.evaluation.segmentation import BOUNDARIES
 from mild_viz.settings import STATE_COLORS
 from mild_viz.trial import PHASES
@@ -53,9 +53,9 @@ class Table:
 Value = TypeVar("Value")
 
 
-def results(group: Comparison) -> Table:
+def results(group: Group) -> Table:
     """Mean squared error of all rows, grouped; the smallest of each column is marked, the paper's aside."""
-    by_label = {label: {row.action: row for row in group.rows if row.model == label} for label in _labels(group)}
+    by_label = group.rows
     models = [model.label for model in group.models]
     ours = [label for label in by_label if label in models or label in BASELINES]
     paper = [label for label in by_label if label not in ours]
@@ -88,13 +88,17 @@ def results(group: Comparison) -> Table:
                 )
             )
             lines.append(Line(label.removeprefix("paper "), cells, "paper" if label in paper else ""))
-    counts = {row.action: f"{row.n_windows} windows, {row.n_trials} trials" for row in group.rows if row.n_windows}
-    unit = "m² × 100, as the paper's “cm”" if group.human_human else "rad²"
-    caption = f"Mean squared error of the predicted windows [{unit}], mean ± standard deviation over test windows"
+    counts = {a: f"{row.n_windows} windows, {row.n_trials} trials" for a, row in by_label["constant"].items()}
+    caption = f"Mean squared error of the predicted windows [{unit(group)}], mean ± standard deviation over windows"
     return Table(caption, [*group.actions, "mean"], lines, [*(counts.get(a, "") for a in group.actions), "of actions"])
 
 
-def states(group: Comparison) -> list[Table]:
+def unit(group: Group) -> str:
+    """Of a squared error. Between humans it is what the paper calls cm."""
+    return "m² × 100" if group.human_human else "rad²"
+
+
+def states(group: Group) -> list[Table]:
     """Occupancy and duration of every state; one table for all variants that cut the trials alike."""
     tables = []
     for names, model in _alike(group.models):
@@ -116,7 +120,7 @@ def states(group: Comparison) -> list[Table]:
     return tables
 
 
-def agreement(group: Comparison) -> Table:
+def agreement(group: Group) -> Table:
     """Human-only beside joint forward variable."""
     lines = []
     for model in group.models:
@@ -132,7 +136,7 @@ def agreement(group: Comparison) -> Table:
     return Table(caption, group.actions, lines)
 
 
-def phase_tables(group: Comparison) -> list[Table]:
+def phase_tables(group: Group) -> list[Table]:
     """Mutual information of states and true phases, and errors of the boundaries; none where phases are unknown."""
     tables = []
     for names, model in _alike(group.models):
@@ -172,7 +176,7 @@ def phase_tables(group: Comparison) -> list[Table]:
     return tables
 
 
-def calibrations(group: Comparison) -> list[Table]:
+def calibrations(group: Group) -> list[Table]:
     """Coverage and energy scores, pooled over actions by windows, and then of each action."""
     unit = "m" if group.human_human else "rad"
     what = "positions" if group.human_human else "joints"
@@ -215,7 +219,7 @@ def _calibration_cells(some: Sequence[Calibration]) -> list[Cell]:
     ]
 
 
-def hands(group: Comparison) -> Table | None:
+def hands(group: Group) -> Table | None:
     """Error of the predicted hand in metres; None where it could not be measured."""
     if not any(one for model in group.models for one in model.hands.values()):
         return None
@@ -238,7 +242,7 @@ def hands(group: Comparison) -> Table | None:
     return Table(f"Distance of {what}, predicted to true [m], mean ± standard deviation", group.actions, lines)
 
 
-def contacts(group: Comparison) -> Table | None:
+def contacts(group: Group) -> Table | None:
     """Distance of the hands in contact for each controller; None without contact or robot."""
     actions = [a for a in group.actions if any(model.contact[a] for model in group.models)]
     if not actions:
@@ -267,14 +271,14 @@ def state_color(state: int) -> str:
     return STATE_COLORS[state % len(STATE_COLORS)]
 
 
-def _cut(model: Measured) -> Mapping[str, tuple]:
+def _cut(model: Result) -> Mapping[str, tuple]:
     """What decides whether two variants cut the trials alike by the human-only forward variable."""
     return {a: (used.occupancy, used.duration, used.back_transitions) for a, used in model.segmentation.items()}
 
 
-def _alike(models: Sequence[Measured]) -> list[tuple[str, Measured]]:
+def _alike(models: Sequence[Result]) -> list[tuple[str, Result]]:
     """Variants that cut the trials alike, by their names, and one of them."""
-    groups: list[list[Measured]] = []
+    groups: list[list[Result]] = []
     for model in models:
         same = next((group for group in groups if _cut(group[0]) == _cut(model)), None)
         if same is None:
@@ -282,10 +286,6 @@ def _alike(models: Sequence[Measured]) -> list[tuple[str, Measured]]:
         else:
             same.append(model)
     return [(", ".join(model.label for model in group), group[0]) for group in groups]
-
-
-def _labels(group: Comparison) -> list[str]:
-    return list(dict.fromkeys(row.model for row in group.rows))
 
 
 def _signed(value: float, digits: int) -> str:
