@@ -21,8 +21,11 @@ from mild_viz.evaluation.page import report
 from mild_viz.evaluation.page.figures import principal_plane
 from mild_viz.evaluation.page.measure import measure_groups
 from mild_viz.evaluation.page.render import render
+from mild_viz.pairs import stack_windows
 from mild_viz.paths import default_checkpoint
+from mild_viz.prediction import predict
 from mild_viz.trial import Dataset, Trial
+from tests.models import random_checkpoint
 
 HOSTILE = "<img src=x onerror=alert(1)> & $x$"
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -163,6 +166,25 @@ def test_a_human_human_model_has_a_page(small_demo: None, tmp_path: Path) -> Non
     assert "second human's wrist" in captions and "hand by forward kinematics" in captions
     assert sum("touch" in caption for caption in page.captions) == 1  # of the robot alone
     assert "Human to second human" in "".join(page.words)
+
+
+def test_a_variant_with_models_of_its_own_is_measured_alike(small: Dataset) -> None:
+    """Its states and contact states are those of its first model, its predictions the average of all."""
+    model = random_checkpoint(variants=("v1",), n_own=2)
+    (group,) = measure_groups([model], small)
+    own = group.models[-1]
+    assert [one.label for one in group.models] == list(model.variants) and own.variant not in model.robot_vaes
+    for action, (one,) in own.passes.items():
+        assert one.hmm is model.members(own.variant)[0].hmms[action]
+        trial = stack_windows([one.trial], model.for_robot().joint_names)
+        said = predict(model, own.variant, action, trial.human)
+        np.testing.assert_array_equal(one.predicted, said.decoded)
+        assert np.nanmean(one.errors) == pytest.approx(group.rows[own.label][action].mse_mean)
+    assert {one.action for one in own.warnings if one.kind == "no contact state"} == {
+        "handshake",
+        "rocket",
+        "parachute",
+    }
 
 
 def test_a_robot_without_description_leaves_distances_out(small: Dataset) -> None:

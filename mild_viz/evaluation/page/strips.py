@@ -81,7 +81,7 @@ def _strips(one: Pass) -> list[Strip]:
 
 def _alpha(one: Pass, log_alpha: np.ndarray) -> list[Run]:
     states, certain = log_alpha.argmax(1), np.exp(log_alpha.max(1))
-    level = sum((certain < threshold).astype(int) for threshold in CERTAINTY)
+    level = (certain[:, None] < np.array(CERTAINTY)).sum(1)
     looks = [
         (f"state {state}", state_color(int(state)), OPACITY[step]) for state, step in zip(states, level, strict=True)
     ]
