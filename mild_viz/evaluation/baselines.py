@@ -107,7 +107,7 @@ def _fit_chosen_nearest(train: Examples, time_weights: Sequence[float]) -> Predi
             sums = rest.partner[_nearest(human + weight**2 * time, NEIGHBOURS[-1])].cumsum(1)
             for column, k in enumerate(min(k, sums.shape[1]) for k in NEIGHBOURS):
                 row[column] += ((sums[:, k - 1] / k - held.partner) ** 2).mean()
-    weight, k = np.unravel_index(errors.argmin(), errors.shape)
+    weight, k = divmod(int(errors.argmin()), len(NEIGHBOURS))
     return fit_nearest(train, NEIGHBOURS[k], time_weights[weight])
 
 

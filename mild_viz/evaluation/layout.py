@@ -117,8 +117,8 @@ def _notes(shown: Sequence[Comparison]) -> list[str]:
     notes = [
         "Difference: mean error of the first minus the second, below 0 where the first is better; over all actions, "
         f"every action counts equally. Interval: whole trials resampled within their action ({N_RESAMPLES} times, "
-        f"seed {SEED}), expanded percentiles, not corrected for the number of comparisons; from few trials it is still "
-        "too narrow.",
+        f"seed {SEED}), expanded percentiles, not corrected for the number of comparisons; from two or three "
+        "trials it covers far less than 95 %.",
         "Smallest p: what the tests over trials can give at best with so many trials.",
         "A12: chance that a window of the first has the larger error (.5: neither; below .29 or above .71: large).",
         "Mann-Whitney U is the paper's window-level test. Windows of a trial overlap and are not independent, "

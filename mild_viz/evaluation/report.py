@@ -166,27 +166,30 @@ def evaluate(
     markdown: Path | None = None,
 ) -> Evaluation:
     """Measure checkpoints as `measure` does, print the tables, and write those files that are given, atomically."""
-    paths = list(dict.fromkeys(checkpoints))
-    named = [path.name for path in paths]
-    models = {
-        path.name if named.count(path.name) == 1 else str(path): load_checkpoint(path) for path in paths
-    }  # names that tell them apart
+    models = load_named(checkpoints)
     result = measure(models, load_dataset(dataset), pairs)
     print_tables(result.tables(each_action=bool(pairs)))
     tables = result.tables()
-    texts = {
-        json: lambda: json_format.dumps(_finite(result.as_json()), indent=2, allow_nan=False) + "\n",
-        csv: lambda: result.as_frame().to_csv(index=False),
-        markdown: lambda: "\n".join(to_markdown(table) for table in tables),
-        latex: lambda: (
-            "% needs \\usepackage{booktabs}\n"
-            + "\n".join(to_latex(table, f"tab:{dataset}-{i}") for i, table in enumerate(tables, 1))
-        ),
-    }
-    for path, text in texts.items():
-        if path is not None:
-            _write(path, text())
+    if json is not None:
+        _write(json, json_format.dumps(_finite(result.as_json()), indent=2, allow_nan=False) + "\n")
+    if csv is not None:
+        _write(csv, result.as_frame().to_csv(index=False))
+    if markdown is not None:
+        _write(markdown, "\n".join(to_markdown(table) for table in tables))
+    if latex is not None:
+        floats = (to_latex(table, f"tab:{dataset}-{i}") for i, table in enumerate(tables, 1))
+        _write(latex, "% needs \\usepackage{booktabs}\n" + "\n".join(floats))
     return result
+
+
+def load_named(paths: Sequence[Path]) -> dict[str, Checkpoint]:
+    """Load checkpoints, each once, by the folder's name, or by the whole path where two have the same name."""
+    paths = list({path.resolve(): path for path in paths}.values())
+    names = [path.resolve().name for path in paths]
+    return {
+        name if names.count(name) == 1 else str(path): load_checkpoint(path)
+        for name, path in zip(names, paths, strict=True)
+    }
 
 
 def _write(path: Path, text: str) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
-from statsmodels.stats.multitest import multipletests
 
 from mild_viz.evaluation.metrics import Measured
 
@@ -98,7 +97,10 @@ def sign_flip_p(differences: Float[np.ndarray, " n"], rng: np.random.Generator) 
 def wilcoxon_p(differences: Float[np.ndarray, " n"]) -> float:
     """Two-sided p of Wilcoxon's signed-rank test; differences of 0 are left out, as he did."""
     differences = differences[differences != 0]
-    return float(stats.wilcoxon(differences).pvalue) if len(differences) else 1.0
+    if not len(differences):
+        return 1.0
+    _, p = stats.wilcoxon(differences)
+    return float(p)
 
 
 def bootstrap_interval(
@@ -127,7 +129,7 @@ def bootstrap_interval(
         return np.mean([sums[index].sum(axis) / counts[index].sum(axis) for index in trials], axis=0)
 
     n, freedom = len(sums), len(sums) - len(members)
-    tail = stats.norm.cdf(-np.sqrt(n / freedom) * stats.t.ppf(1 - LEVEL / 2, freedom))
+    tail = float(stats.norm.cdf(-np.sqrt(n / freedom) * stats.t.ppf(1 - LEVEL / 2, freedom)))
     interval = stats.bootstrap(
         members,
         mean,
@@ -161,15 +163,18 @@ def _compare(first: Measured, second: Measured, names: tuple[str, str], action: 
     )  # fmt: skip
 
 
+def holm_p(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """p values after Holm's step-down correction over a family, NaN (tests that were not made) left out."""
+    corrected = np.full_like(p, np.nan)
+    order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]  # NaN is sorted last
+    steps = p[order] * np.arange(len(order), 0, -1)
+    corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return corrected
+
+
 def holm(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """Fill in the p values after Holm's correction over these comparisons, each test for itself."""
-    corrected = {}
-    for test in TESTS:
-        p = np.array([getattr(comparison, f"{test}_p") for comparison in comparisons])
-        known = ~np.isnan(p)
-        if known.any():
-            p[known] = multipletests(p[known], LEVEL, method="holm")[1]
-        corrected[f"{test}_p_holm"] = p
+    corrected = {f"{test}_p_holm": holm_p(np.array([getattr(c, f"{test}_p") for c in comparisons])) for test in TESTS}
     # No corrected p is below this: Holm multiplies the smallest by their number, and lets none fall below it.
     floor = min(1.0, len(comparisons) * min((comparison.smallest_p for comparison in comparisons), default=1.0))
     return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # texts stay texts: small, and in the page's own font
     "svg.hashsalt": "mild_viz",  # the same figure is the same file
     "text.parse_math": False,  # a checkpoint's name may hold a dollar sign
@@ -134,7 +134,15 @@ def _latent(
         ax.add_patch(Ellipse(tuple(center), width, height, angle=angle, facecolor=color, alpha=0.16, zorder=3))
         ax.add_patch(Ellipse(tuple(center), width, height, angle=angle, fill=False, edgecolor=color, lw=1.2, zorder=3))
         ax.text(
-            *center, str(state), ha="center", va="center", fontsize=9, fontweight="bold", zorder=4, path_effects=halo
+            center[0],
+            center[1],
+            str(state),
+            ha="center",
+            va="center",
+            fontsize=9,
+            fontweight="bold",
+            zorder=4,
+            path_effects=halo,
         )
     ax.autoscale_view()
     ax.set_title(title)
@@ -180,7 +188,7 @@ def _grid(n: int, height: float) -> tuple[Figure, Sequence[Axes]]:
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for extra in axes[n:]:
         extra.remove()
-    return figure, axes[:n]
+    return figure, list(axes[:n])
 
 
 def _svg(figure: Figure) -> str:
