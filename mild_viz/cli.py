@@ -121,6 +121,7 @@ def train(
     epochs: OptionalInt = None,
     seed: int = 0,
     resume: bool = False,
+    state_model: Literal["hmm", "hsmm"] = "hmm",
 ) -> None:
     """Train a model: Algorithms 1 and 2 of the paper.
 
@@ -139,15 +140,16 @@ def train(
         epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
         seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
         resume: Go on from the state in --out, where an earlier run was interrupted.
+        state_model: Kind of state model: hmm, or hsmm with Gaussian durations of states. Example: --state-model hsmm
     """
     from mild_viz.training.run import train as run
 
-    out = out or Path("runs") / f"{dataset}-{stage}"
     made = run(
-        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume, seed=seed
-    )
-    print(f"{out}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
-    print(f"next: mild-viz evaluate --checkpoint {out} --dataset {dataset}")
+        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, resume=resume, seed=seed,
+        out=out or Path("runs") / f"{dataset}-{stage}", state_model=state_model,
+    )  # fmt: skip
+    print(f"{made.path}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
+    print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {dataset}")
 
 
 def rollout(run: RunOptions, out: Path) -> None:

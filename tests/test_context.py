@@ -47,7 +47,7 @@ def test_without_noise_one_state_is_least_squares() -> None:
 
 
 def test_noise_is_the_posterior_covariance_of_the_paper() -> None:
-    """With the newest latent alone as context, K_i is that of Eq. conditioning-withcov-K-i for a posterior of that std."""
+    """With the newest latent alone as context, K_i is that of Eq. conditioning-withcov-K-i."""
     rng = np.random.default_rng(1)
     hmm = random_hmm(rng, 1, 6)
     z = rng.multivariate_normal(hmm.emission_means[0], hmm.emission_covariances[0], size=200_000)

@@ -19,7 +19,7 @@ from mild_viz.latent.hmm import unobserved_forward
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import PAPER_VARIANTS
+from mild_viz.settings import PAPER_VARIANTS, VARIANTS
 from mild_viz.training import run as training_run
 from mild_viz.training.human_stage import HumanModel, complete_rows, prior_states, train_human_stage
 from mild_viz.training.networks import BatchedVAE, gaussian_kl, standard_kl
@@ -95,16 +95,16 @@ def test_training_samples_have_the_papers_distribution(
     humans: list[HumanModel], human_data: Windows, variant: str
 ) -> None:
     data = complete_rows(human_data)
-    centre, factor = conditional_factors(humans[0], data, PAPER_VARIANTS[variant])
+    centre, factor = conditional_factors(humans[0], data, VARIANTS[variant])
     row = 200
     trial, step = int(data.trial[row]), int(data.step[row])
     hmm = humans[0].hmms[data.actions[trial]]
     log_alpha = unobserved_forward(hmm, step + 1)[step:]
     mean, std = humans[0].vae.encode(data.human[row : row + 1])
-    posterior = std if PAPER_VARIANTS[variant].posterior_covariance else None
+    posterior = std if VARIANTS[variant].posterior_covariance else None
     expected, covariance = condition(hmm, mean, log_alpha, posterior)
     np.testing.assert_allclose(centre[row], expected[0], atol=1e-10)
-    if PAPER_VARIANTS[variant].conditional_training == "conditional-samples":
+    if VARIANTS[variant].conditional_training == "conditional-samples":
         np.testing.assert_allclose(factor[row] @ factor[row].T, covariance[0], atol=1e-5)
     else:  # conditioned samples of the posterior, by brute force
         eps = np.random.default_rng(0).normal(size=(50, 5))
@@ -132,7 +132,7 @@ def test_conditional_training_lowers_the_error_of_conditioned_predictions(
     robots = train_robot_stage(data, humans, ("v1", "v3.1"), options, silent)
     usable = complete_rows(data)
     for human, robot in zip(humans, robots, strict=True):
-        centre, _ = conditional_factors(human, usable, PAPER_VARIANTS["v3.1"])
+        centre, _ = conditional_factors(human, usable, VARIANTS["v3.1"])
         errors = {name: ((vae.decode(centre) - usable.partner) ** 2).mean() for name, vae in robot.items()}
         constant = ((usable.partner.mean(0) - usable.partner) ** 2).mean()
         assert errors["v3.1"] < constant and errors["v3.1"] < errors["v1"]
@@ -221,7 +221,7 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
     assert (again.path / "weights.safetensors").read_bytes() == (out / "weights.safetensors").read_bytes()
 
     human = train("demo", "hhi", seeds=1, epochs=1, out=tmp_path / "human")
-    assert human.robot is None and load_checkpoint(human.path).variants == ()
+    assert human.robot is None and load_checkpoint(human.path).variants == ("v1",)
 
 
 def test_wrong_options_are_named(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM
 from mild_viz.latent.interaction import InteractionModel
+from mild_viz.latent.state_models import state_model_of
 from mild_viz.latent.vae import VAE
 from mild_viz.settings import VARIANTS, Placement, choose
 
@@ -67,6 +68,11 @@ class Checkpoint:
     @property
     def n_states(self) -> int:
         return next(iter(self.hmms.values())).n_states
+
+    @property
+    def state_model(self) -> str:
+        """The kind of the hidden-state models, a name in `STATE_MODELS`."""
+        return state_model_of(next(iter(self.hmms.values())))
 
     def hmm(self, action: str) -> HMM:
         choose(f"checkpoint {self.name}: action", action, self.actions)

@@ -1,4 +1,4 @@
-"""One trained model: encode -> filter -> condition -> decode, over a whole trial or from one observation to the next."""
+"""One trained model: encode -> filter -> condition -> decode, over a whole trial or one observation at a time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mild_viz.latent.context import ContextLayout, ContextRegression, condition_on_context
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows
+from mild_viz.latent.hmm import HMM, FilterCarry, log_emission, observed_rows
 from mild_viz.latent.vae import VAE
 
 
@@ -34,7 +34,7 @@ class Prediction(NamedTuple):
 class ModelCarry(NamedTuple):
     """What one window leaves to the next."""
 
-    log_alpha: Float[np.ndarray, " S"] | None
+    filter: FilterCarry | None
     history: Float[np.ndarray, "L D"]
     """The last human latents, gaps filled with the one before; as many as the longest lag, fewer at the beginning."""
     step: int
@@ -79,7 +79,7 @@ class InteractionModel:
         """
         hmm, human_hmm = self.hmms[action], self.human_hmms[action]
         mean, std = self.human_vae.encode(human)
-        log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean), carry.log_alpha)
+        log_alpha, _, filtered = human_hmm.filter(log_emission(human_hmm, mean), carry.filter)
         history = carry.history
         if action in self.regressions:
             filled = _fill_forward(mean, history)
@@ -98,7 +98,7 @@ class InteractionModel:
         else:
             robot_mean, robot_covariance = condition(hmm, mean, log_alpha, std if posterior_covariance else None)
         decoded = self.robot_vae.decode(robot_mean)
-        following = ModelCarry(log_alpha[-1], history, carry.step + len(human))
+        following = ModelCarry(filtered, history, carry.step + len(human))
         return Prediction(mean, std, log_alpha, robot_mean, robot_covariance, decoded), following
 
 

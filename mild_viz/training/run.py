@@ -82,18 +82,19 @@ def train(
     out: Path = Path("runs/model"),
     resume: bool = False,
     seed: int = 0,
+    state_model: str = "hmm",
 ) -> Checkpoint:
     """Train a model and write its folder; the stages' state lives beside it until the folder is written.
 
     Raises:
-        UserError: on an unknown dataset, stage or variant, a dataset without a second human, a run that cannot
-            be resumed, or a folder that holds something else.
+        UserError: on an unknown dataset, stage, variant or state model, a dataset without a second human, a run that
+            cannot be resumed, or a folder that holds something else.
     """
     choose("stage", stage, ("hhi", "hri"))
     variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
     if not variants:
         raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
-    options = TrainingOptions(seeds=seeds, seed=seed)
+    options = TrainingOptions(seeds=seeds, seed=seed, state_model=state_model)
     if epochs is not None:
         options = replace(options, human_epochs=epochs, robot_epochs=epochs)
     check_checkpoint_target(out)
@@ -110,6 +111,7 @@ def train(
     command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
     command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
     command += ["--seed", str(seed)] if seed else []
+    command += ["--state-model", state_model] if state_model != TrainingOptions.state_model else []
     command += ["--out", str(out)]
     training = {
         "command": shlex.join(command),
