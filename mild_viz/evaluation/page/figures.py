@@ -47,12 +47,15 @@ MODEL_COLOR = "#0072B2"
 MOST_TRIALS = 12
 """Trajectories that a latent plot shows at most; more hide one another."""
 
+BAND = (0.1, 0.9)
+"""Quantiles of the trials between which a curve's band lies; of two or three trials that is nearly their range."""
+
 SMOOTHING = 0.3
 """Curves are means over this much time [s]."""
 
 
 def error_curves(group: Group) -> str:
-    """Error over time of every action: the best variant beside baselines; line: median of trials, band: their range."""
+    """Error over time of every action: the best variant beside baselines; median and `BAND` of trials."""
     with _style():
         figure, axes = _grid(len(group.actions), 2.3)
         for ax, action in zip(axes, group.actions, strict=True):
@@ -152,7 +155,7 @@ def _latent(
 
 
 def _curve(ax: Axes, errors: Sequence[Float[np.ndarray, " _"]], rate: float, color: str, dashes, label: str) -> None:
-    """Median and range over the trials that last so long."""
+    """Median and band over the trials that last so long."""
     longest = max(len(trial) for trial in errors)
     table = np.full((len(errors), longest), np.nan)
     for row, trial in zip(table, errors, strict=True):
@@ -161,7 +164,8 @@ def _curve(ax: Axes, errors: Sequence[Float[np.ndarray, " _"]], rate: float, col
     time = np.flatnonzero(seen) / rate
     table = table[:, seen]
     if label != "constant":  # its band hides the others
-        ax.fill_between(time, np.nanmin(table, 0), np.nanmax(table, 0), color=color, alpha=0.13, linewidth=0)
+        low, high = np.nanquantile(table, BAND, axis=0)
+        ax.fill_between(time, low, high, color=color, alpha=0.13, linewidth=0)
     ax.plot(time, np.nanmedian(table, 0), color=color, linestyle=dashes, linewidth=1.4, label=label)
 
 
