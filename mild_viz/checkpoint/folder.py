@@ -89,12 +89,12 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
                 loaded = load_checkpoint(built)
             except UserError as error:
                 raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
-            if target.exists():
-                os.replace(target, old)
             try:
+                if target.exists():
+                    os.replace(target, old)
                 os.replace(built, target)
-            except OSError:
-                if old.exists():
+            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
+                if old.exists() and not target.exists():
                     os.replace(old, target)
                 raise
         finally:
@@ -142,6 +142,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         rate=config.rate,
         contact_states=config.contact_states,
         own_contact_states=config.own_contact_states,
+        transition_states=parts.transition_states,
         placement=config.placement,
         hidden=config.hidden,
         training=config.training,

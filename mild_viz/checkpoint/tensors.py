@@ -15,6 +15,7 @@ from mild_viz.latent.context import ContextLayout, ContextRegression
 from mild_viz.latent.hmm import HMM
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.state_models import STATE_MODELS
+from mild_viz.latent.transition import TransitionState, check_transition_state
 from mild_viz.latent.vae import VAE, make_vae
 from mild_viz.settings import HUMAN_FEATURES, WINDOW
 
@@ -22,6 +23,7 @@ from mild_viz.settings import HUMAN_FEATURES, WINDOW
 def tensors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """Everything by name. Networks in single precision, in which they were trained; the rest in double."""
     tensors = _vae_tensors("human/", checkpoint.human_vae) | _hmm_tensors("hmm/", checkpoint.hmms)
+    tensors |= _transition_tensors("transition/", checkpoint.transition_states, checkpoint.n_states)
     for variant, vae in checkpoint.robot_vaes.items():
         tensors |= _vae_tensors(f"robot/{variant}/", vae)
     for variant, models in checkpoint.own_models.items():
@@ -29,6 +31,7 @@ def tensors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
             part = f"{variant}/{index}/"
             tensors |= _vae_tensors(f"{part}human/", model.human_vae) | _vae_tensors(f"{part}robot/", model.robot_vae)
             tensors |= _hmm_tensors(f"{part}hmm/", model.hmms)
+            tensors |= _transition_tensors(f"{part}transition/", model.transition_states, checkpoint.n_states)
             for action, regression in model.regressions.items():
                 for name in ContextRegression.__dataclass_fields__:
                     tensors[f"{part}regression/{action}/{name}"] = getattr(regression, name)
@@ -45,6 +48,19 @@ def _hmm_tensors(part: str, hmms: Mapping[str, HMM]) -> dict[str, np.ndarray]:
         for action, hmm in hmms.items()
         for field in fields(hmm)
     }
+
+
+def _transition_tensors(part: str, states: Mapping[str, TransitionState], n_states: int) -> dict[str, np.ndarray]:
+    """The transition states of one model, by action below `part`; contact states as 1 among 0."""
+    tensors = {}
+    for action, state in states.items():
+        tensors |= {
+            f"{part}{action}/mean": state.mean,
+            f"{part}{action}/covariance": state.covariance,
+            f"{part}{action}/hazard": np.array([state.hazard]),
+            f"{part}{action}/contact_states": np.isin(np.arange(n_states), sorted(state.contact_states)).astype(float),
+        }
+    return tensors
 
 
 def _checked(tensors: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
@@ -90,6 +106,28 @@ def _read_regressions(
     return regressions
 
 
+def _read_transition_states(
+    tensors: Mapping[str, np.ndarray], part: str, config: Config, where: str
+) -> dict[str, TransitionState]:
+    """Those of the actions that have one: older checkpoints have none."""
+    n_states, size, result = config.n_states, config.latent_size, {}
+    for action in config.actions:
+        key = f"{part}{action}"
+        if not any(name.startswith(f"{key}/") for name in tensors):
+            continue
+        mean, covariance, hazard, contact = (
+            _checked(tensors, f"{key}/{name}", shape, where)
+            for name, shape in (
+                ("mean", (size,)), ("covariance", (size, size)), ("hazard", (1,)), ("contact_states", (n_states,))
+            )
+        )  # fmt: skip
+        if not np.isin(contact, (0.0, 1.0)).all():
+            raise UserError(f"{where}: tensor '{key}/contact_states' is {contact}, expected 0 or 1 for every state")
+        state = TransitionState(mean, covariance, float(hazard[0]), frozenset(np.flatnonzero(contact).tolist()))
+        result[action] = check_transition_state(state, f"{where}: {key}")
+    return result
+
+
 def _read_vae(tensors: Mapping[str, np.ndarray], part: str, input_size: int, config: Config, where: str) -> VAE:
     own = {name.removeprefix(part): value for name, value in tensors.items() if name.startswith(part)}
     return make_vae(own, input_size, config.hidden, config.latent_size, f"{where}: {part.rstrip('/')}")
@@ -102,6 +140,7 @@ class Parts(NamedTuple):
     hmms: dict[str, HMM]
     robot_vaes: dict[str, VAE]
     own_models: dict[str, tuple[InteractionModel, ...]]
+    transition_states: dict[str, TransitionState]
 
 
 def read_parts(tensors: Mapping[str, np.ndarray], config: Config, where: str) -> Parts:
@@ -120,6 +159,7 @@ def read_parts(tensors: Mapping[str, np.ndarray], config: Config, where: str) ->
             _read_vae(tensors, f"{part}robot/", robot_input, config, where),
             layout,
             _read_regressions(tensors, f"{part}regression/", config, layout.size(config.latent_size), where),
+            _read_transition_states(tensors, f"{part}transition/", config, where),
         )
 
     return Parts(
@@ -130,4 +170,5 @@ def read_parts(tensors: Mapping[str, np.ndarray], config: Config, where: str) ->
             variant: tuple(own_model(f"{variant}/{index}/", own.layout) for index in range(own.n_models))
             for variant, own in config.own_models.items()
         },
+        _read_transition_states(tensors, "transition/", config, where),
     )
