@@ -11,13 +11,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from mild_viz import paths
 from mild_viz.errors import UserError
+from mild_viz.evaluate_commands import evaluate, report
 from mild_viz.run_options import (
     OptionalInt,
-    OptionalNames,
     OptionalPath,
-    OptionalPaths,
     OptionalText,
     OptionalVariant,
     RunOptions,
@@ -116,42 +114,6 @@ def data_check(path: tyro.conf.Positional[Path]) -> None:
     leave(check(path))
 
 
-def evaluate(
-    checkpoint: OptionalPaths = None,
-    dataset: str = "demo",
-    compare: OptionalNames = None,
-    json: OptionalPath = None,
-    csv: OptionalPath = None,
-    markdown: OptionalPath = None,
-    latex: OptionalPath = None,
-) -> None:
-    """Measure models on the test trials, beside simple baselines and the paper's figures.
-
-    For every variant and action: mean squared error of the predicted robot windows [rad^2], its standard deviation
-    over windows, the number of windows and trials; beside them a constant mean, a time-indexed mean, ridge regression
-    and nearest neighbours fitted on the training trials. Then the differences between predictors, with tests over
-    trials beside the paper's test over windows. Example: mild-viz evaluate --dataset nuisi --json nuisi.json
-
-    Args:
-        checkpoint: Folders of trained models, one or several; what several hold is summed up by best and median.
-            Default: the shipped model of the dataset. Example: --checkpoint runs/a runs/b
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
-        compare: Predictors to compare, each with each. Default: every variant with knn-time, over all actions.
-            A variant that several checkpoints hold stands for the average of their errors; VARIANT@CHECKPOINT is one
-            of them. Example: --compare v3.1 v1 ridge
-        json: File for all figures, as lists of records. Default: print only. Example: --json results.json
-        csv: File for the errors, as a table in long form. Default: print only. Example: --csv results.csv
-        markdown: File for the tables as Markdown. Default: print only. Example: --markdown results.md
-        latex: File for the tables as LaTeX (booktabs). Default: print only. Example: --latex results.tex
-    """
-    for path, suffix in ((json, ".json"), (csv, ".csv"), (markdown, ".md"), (latex, ".tex")):
-        if path is not None:
-            check_output(path, suffix)
-    from mild_viz.evaluation.report import evaluate as run
-
-    run(checkpoint or [paths.default_checkpoint(dataset)], dataset, compare or (), json, csv, latex, markdown)
-
-
 def rollout(run: RunOptions, out: Path) -> None:
     """Run the pipeline on one trial and write the arrays to an .npz file.
 
@@ -235,6 +197,7 @@ COMMANDS = {
     "train": train,
     "sweep": sweep,
     "evaluate": evaluate,
+    "report": report,
     "rollout": rollout,
     "record": record,
     "import-published": import_published,

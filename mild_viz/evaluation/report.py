@@ -24,7 +24,6 @@ from mild_viz.evaluation.metrics import (
     joint_names,
     measure_baselines,
     measure_model,
-    measured_variants,
     published_rows,
 )
 from mild_viz.evaluation.runs import MEAN, OverRuns, over_checkpoints, over_recorded_seeds
@@ -151,7 +150,7 @@ def measure(checkpoints: dict[str, Checkpoint], dataset: Dataset, pairs: Sequenc
 
 def choose_pairs(names: Sequence[str], checkpoints: dict[str, Checkpoint]) -> list[tuple[str, str]]:
     """The pairs that `measure` compares; an error lists the names that may be given."""
-    held = [(variant, name) for name, model in checkpoints.items() for variant in measured_variants(model)]
+    held = [(variant, name) for name, model in checkpoints.items() for variant in model.variants]
     variants = list(dict.fromkeys(variant for variant, _ in held))
     if not names:
         return [(variant, REFERENCE) for variant in variants]
