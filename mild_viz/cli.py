@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mild_viz import paths
+from mild_viz.cli_training import train_baseline
 from mild_viz.errors import UserError
 from mild_viz.run_options import (
     OptionalInt,
@@ -259,6 +260,7 @@ COMMANDS = {
     "app": app,
     "data": data,
     "train": train,
+    "train-baseline": train_baseline,
     "evaluate": evaluate,
     "rollout": rollout,
     "record": record,

@@ -6,9 +6,10 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -32,6 +33,8 @@ from mild_viz.settings import HUMAN_FEATURES, WINDOW
 
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
 FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
+
+Model = TypeVar("Model")
 
 
 def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
@@ -74,7 +77,15 @@ def check_checkpoint_target(out: Path) -> None:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoint:
-    """Write a checkpoint's folder, and return it as loaded from there.
+    """Write a checkpoint's folder, and return it as loaded from there. See `save_folder` for its errors."""
+    loaded = save_folder(path, _tensors(checkpoint), config_of(checkpoint), readme, load_checkpoint)
+    return replace(loaded, path=path)
+
+
+def save_folder(
+    path: Path, tensors: dict[str, np.ndarray], config: dict[str, Any], readme: str, load: Callable[[Path], Model]
+) -> Model:
+    """Write a model's folder, and return it as `load` reads it.
 
     It is built beside its place, loaded to see that it is valid, and then moved there whole. An older
     checkpoint there is replaced, contact_states.json that a person saved in it included: it names states
@@ -92,12 +103,12 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
         built, old = work / "new", work / "old"
         try:
             built.mkdir()
-            save_file(_tensors(checkpoint), built / WEIGHTS)
+            save_file(tensors, built / WEIGHTS)
             (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
-            (built / CONFIG).write_text(json.dumps(config_of(checkpoint), indent=2) + "\n", encoding="utf-8")
+            (built / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
             (built / README).write_text(readme, encoding="utf-8", errors="replace")
             try:
-                loaded = load_checkpoint(built)
+                loaded = load(built)
             except UserError as error:
                 raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
             if target.exists():
@@ -113,7 +124,17 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path} cannot be written: {reason}; choose another place") from None
-    return replace(loaded, path=path)
+    return loaded
+
+
+def load_tensors(file: Path) -> dict[str, np.ndarray]:
+    """The content of a safetensors file. Raises `UserError` where it is missing or damaged."""
+    if not file.is_file():
+        raise UserError(f"{file} is missing")
+    try:
+        return load_file(file)
+    except Exception as error:  # besides its own error it has KeyError for a number type that NumPy lacks
+        raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
 
 
 def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, n_states: int, size: int, where: str) -> HMM:
@@ -132,7 +153,7 @@ def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, n_states: int, siz
     return check_hmm(HMM(**values), f"{where}: hmm/{action}")
 
 
-def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
@@ -153,12 +174,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             "as written by `mild-viz train` or `mild-viz import-published`"
         )
     config = read_config(config_file)
-    if not file.is_file():
-        raise UserError(f"{file} is missing")
-    try:
-        tensors = load_file(file)
-    except Exception as error:  # besides its own error it has KeyError for a number type that NumPy lacks
-        raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
+    tensors = load_tensors(file)
     hidden, latent, robot = config.hidden, config.latent_size, config.robot
     robot_input = WINDOW * (len(robot.joint_names) if robot else HUMAN_FEATURES)
     checkpoint = Checkpoint(
@@ -166,10 +182,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
         name=config.name,
         dataset=config.dataset,
         dataset_checksum=config.dataset_checksum,
-        human_vae=make_vae(_part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
+        human_vae=make_vae(part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
         hmms={action: _read_hmm(tensors, action, config.n_states, 2 * latent, str(file)) for action in config.actions},
         robot_vaes={
-            name: make_vae(_part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
+            name: make_vae(part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
             for name in config.variants
         },
         robot=robot,

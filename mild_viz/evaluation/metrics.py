@@ -11,7 +11,9 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
+from mild_viz.evaluation import buetepage
 from mild_viz.evaluation.baselines import BASELINES, Examples
+from mild_viz.evaluation.buetepage import BUETEPAGE, Buetepage
 from mild_viz.evaluation.paper import paper_rows
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import forward_filter, log_emission
@@ -103,10 +105,13 @@ def baseline_rows(dataset: str, train: Windows, test: Windows, human_human: bool
     return rows
 
 
-def model_rows(checkpoint: Checkpoint, trials: Sequence[Trial]) -> list[Row]:
-    """Every variant of a checkpoint on the given trials of one dataset."""
+def model_rows(checkpoint: Checkpoint | Buetepage, trials: Sequence[Trial]) -> list[Row]:
+    """Every variant of a checkpoint, or a baseline that is trained, on the given trials of one dataset."""
     human_human = checkpoint.robot is None
     data = stack_windows(trials, checkpoint.robot.joint_names if checkpoint.robot else None)
+    if isinstance(checkpoint, Buetepage):
+        predicted = buetepage.predict_windows(checkpoint, data)
+        return _summaries(trials[0].dataset, BUETEPAGE, data, predicted, human_human)
     variants = ("v1",) if human_human else checkpoint.variants
     rows = []
     for variant in variants:
@@ -115,7 +120,7 @@ def model_rows(checkpoint: Checkpoint, trials: Sequence[Trial]) -> list[Row]:
     return rows
 
 
-def evaluation_rows(checkpoint: Checkpoint, dataset: Dataset) -> list[Row]:
+def evaluation_rows(checkpoint: Checkpoint | Buetepage, dataset: Dataset) -> list[Row]:
     """The whole table of one checkpoint on a dataset's test split: variants, baselines, the paper's rows."""
     human_human = checkpoint.robot is None
     joints = checkpoint.robot.joint_names if checkpoint.robot else None

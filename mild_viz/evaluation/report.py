@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mild_viz.checkpoint import load_checkpoint
 from mild_viz.data.load import load_dataset
+from mild_viz.evaluation.buetepage import load_model
 from mild_viz.evaluation.metrics import Row, evaluation_rows
 from mild_viz.files import write_atomically
 
@@ -21,7 +21,7 @@ def evaluate(checkpoint: Path, dataset: str, json: Path | None = None) -> list[R
 
     Prints the table; with `json`, also writes {"rows": [...]} there, atomically.
     """
-    model = load_checkpoint(checkpoint)
+    model = load_model(checkpoint)
     source = load_dataset(dataset)
     rows = evaluation_rows(model, source)
     unit = "rad^2" if model.robot is not None else "m^2 x 100 (the paper's 'cm')"
