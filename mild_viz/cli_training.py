@@ -28,7 +28,7 @@ def train_baseline(
         dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset yumi
         human_human: Predict the second human's arm instead of a robot.
         seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
-        epochs: Passes over the training trials in each stage. Default: 400, as the paper's authors. Example: --epochs 50
+        epochs: Passes over the training trials in each stage. Default: 400, as the authors. Example: --epochs 50
         seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
     """
     from mild_viz.training.buetepage.run import train_buetepage

@@ -136,7 +136,7 @@ def predict_windows(model: Buetepage, data: Windows) -> Float[np.ndarray, "R Y"]
     A row whose human window has a gap is NaN, and the recurrent networks skip it.
     """
     predicted = np.full_like(data.partner, np.nan)
-    observed = np.isfinite(data.human).all(1)
+    observed = np.logical_and.reduce(np.isfinite(data.human), axis=1)
     for trial, action in enumerate(data.actions):
         rows = np.arange(len(observed))[data.rows(trial)]
         rows = rows[observed[rows]]

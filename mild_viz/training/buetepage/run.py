@@ -160,7 +160,9 @@ def _readme(model: Buetepage, source: Dataset) -> str:
     lines = [
         f"# {model.name}",
         "",
-        f"Our implementation of the baseline of Bütepage et al. (2020): predicts {partner}, trained on {source.title}, by:",
+        f"Our implementation of the baseline of Bütepage et al. (2020). It predicts {partner}.",
+        "",
+        f"Trained on {source.title}, by:",
         "",
         f"    {model.training['command']}",
         "",
