@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mild_viz.rollout import Rollout
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
-VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2"]
+VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
 
@@ -27,7 +27,7 @@ SplitName = Literal["train", "test"]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
-    VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2}", help_behavior_hint="")
+    VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
 ]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]

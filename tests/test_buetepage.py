@@ -51,7 +51,7 @@ def random_model(seed: int = 0, human_human: bool = False) -> Buetepage:
     shapes = dynamics_shapes(N_ACTIONS, len(robot.joint_names) if robot else None)
     tensors = {name: rng.normal(size=shape) / np.sqrt(shape[-1]) for name, shape in shapes.items()}
     vae = random_vae(rng, 90 if human_human else 20)
-    return Buetepage(Path("nowhere"), "random", "demo", "0" * 64, ACTIONS, robot, vae, tensors)
+    return Buetepage(Path("nowhere"), "random", "demo", "0" * 64, ACTIONS, robot, vae, tensors, rate=30.0)
 
 
 @pytest.fixture(scope="module")
@@ -300,6 +300,7 @@ def test_each_kind_of_folder_is_loaded_as_what_it_is(folder: Path, tmp_path: Pat
         ("schema_version", 7, "schema_version is 7, this program reads 1"),
         ("robot", {"name": "pepper"}, "robot: missing joint_names"),
         ("robot", None, r"tensor 'encoder.0.weight' has shape \(40, 20\), expected \(40, 90\)"),
+        ("rate", "fast", "rate is 'fast', expected a number"),
         ("training", 5, r"training is 5, expected an object"),
         ("dataset", {"name": "demo"}, "dataset.checksum is None, expected a text"),
     ],
@@ -314,9 +315,9 @@ def test_a_bad_config_is_named(folder: Path, field: str, value: Any, message: st
 def test_bad_weights_are_named(folder: Path) -> None:
     file = folder / "weights.safetensors"
     tensors = load_file(file)
-    del tensors["dynamics/rest"]
+    del tensors["rest"]
     save_file(tensors, file)
-    with pytest.raises(UserError, match=r"weights\.safetensors: dynamics: tensor 'rest' is missing"):
+    with pytest.raises(UserError, match=r"weights\.safetensors: tensor 'rest' is missing"):
         load_buetepage(folder)
     file.write_bytes(b"nothing")
     with pytest.raises(UserError, match="is not a readable safetensors file"):

@@ -17,19 +17,23 @@ from safetensors.numpy import load_file, save_file
 
 from mild_viz.checkpoint.config import (
     SCHEMA_VERSION,
+    Config,
     check_states,
     config_of,
     is_config,
     parse_contact_states,
     read_config,
     read_json,
+    states_as_json,
 )
 from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.files import write_atomically
+from mild_viz.latent.context import ContextRegression
 from mild_viz.latent.hmm import HMM, check_hmm
-from mild_viz.latent.vae import make_vae
-from mild_viz.settings import HUMAN_FEATURES, WINDOW
+from mild_viz.latent.interaction import InteractionModel
+from mild_viz.latent.vae import VAE, make_vae
+from mild_viz.settings import HUMAN_FEATURES, WINDOW, choose
 
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
 FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
@@ -38,13 +42,28 @@ Model = TypeVar("Model")
 
 
 def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    tensors = {f"human/{name}": value for name, value in checkpoint.human_vae.weights.items()}
-    for action, hmm in checkpoint.hmms.items():
-        for name in HMM.__dataclass_fields__:
-            tensors[f"hmm/{action}/{name}"] = getattr(hmm, name)
+    """Everything by name. Networks in single precision, in which they were trained; the rest in double."""
+    tensors = _vae_tensors("human/", checkpoint.human_vae) | _hmm_tensors("hmm/", checkpoint.hmms)
     for variant, vae in checkpoint.robot_vaes.items():
-        tensors |= {f"robot/{variant}/{name}": value for name, value in vae.weights.items()}
+        tensors |= _vae_tensors(f"robot/{variant}/", vae)
+    for variant, models in checkpoint.own_models.items():
+        for index, model in enumerate(models):
+            part = f"{variant}/{index}/"
+            tensors |= _vae_tensors(f"{part}human/", model.human_vae) | _vae_tensors(f"{part}robot/", model.robot_vae)
+            tensors |= _hmm_tensors(f"{part}hmm/", model.hmms)
+            for action, regression in model.regressions.items():
+                for name in ContextRegression.__dataclass_fields__:
+                    tensors[f"{part}regression/{action}/{name}"] = getattr(regression, name)
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+
+
+def _vae_tensors(part: str, vae: VAE) -> dict[str, np.ndarray]:
+    return {f"{part}{name}": value.astype(np.float32) for name, value in vae.weights.items()}
+
+
+def _hmm_tensors(part: str, hmms: Mapping[str, HMM]) -> dict[str, np.ndarray]:
+    names = HMM.__dataclass_fields__
+    return {f"{part}{action}/{name}": getattr(hmm, name) for action, hmm in hmms.items() for name in names}
 
 
 def check_checkpoint_target(out: Path) -> None:
@@ -137,23 +156,64 @@ def load_tensors(file: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
 
 
-def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, n_states: int, size: int, where: str) -> HMM:
+def _checked(tensors: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """A tensor in double precision, or an error that names it, its shape and the expected one."""
+    if name not in tensors:
+        raise UserError(f"{where}: tensor '{name}' is missing")
+    if tensors[name].shape != shape:
+        raise UserError(f"{where}: tensor '{name}' has shape {tensors[name].shape}, expected {shape}")
+    return tensors[name].astype(np.float64)
+
+
+def _read_hmm(tensors: Mapping[str, np.ndarray], key: str, n_states: int, size: int, where: str) -> HMM:
     shapes = {
         "initial_probs": (n_states,), "transition_matrix": (n_states, n_states),
         "emission_means": (n_states, size), "emission_covariances": (n_states, size, size),
     }  # fmt: skip
-    values = {}
-    for name, shape in shapes.items():
-        key = f"hmm/{action}/{name}"
-        if key not in tensors:
-            raise UserError(f"{where}: tensor '{key}' is missing")
-        if tensors[key].shape != shape:
-            raise UserError(f"{where}: tensor '{key}' has shape {tensors[key].shape}, expected {shape}")
-        values[name] = tensors[key].astype(np.float64)
-    return check_hmm(HMM(**values), f"{where}: hmm/{action}")
+    values = {name: _checked(tensors, f"{key}/{name}", shape, where) for name, shape in shapes.items()}
+    return check_hmm(HMM(**values), f"{where}: {key}")
 
 
-def part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def _read_regression(
+    tensors: Mapping[str, np.ndarray], key: str, n_states: int, latent: int, context: int, where: str
+) -> ContextRegression:
+    shapes = {
+        "gain": (n_states, latent, context), "offset": (n_states, latent), "covariance": (n_states, latent, latent)
+    }  # fmt: skip
+    values = {name: _checked(tensors, f"{key}/{name}", shape, where) for name, shape in shapes.items()}
+    for name, value in values.items():
+        if not np.isfinite(value).all():
+            raise UserError(f"{where}: tensor '{key}/{name}' has values that are not finite")
+    if not np.linalg.eigvalsh(values["covariance"]).min() > 0.0:
+        raise UserError(f"{where}: tensor '{key}/covariance' is not positive definite")
+    return ContextRegression(**values)
+
+
+def _read_own_models(
+    tensors: Mapping[str, np.ndarray], config: Config, robot_input: int, where: str
+) -> dict[str, tuple[InteractionModel, ...]]:
+    """The models of the variants that have their own."""
+    latent, states, result = config.latent_size, config.n_states, {}
+    for variant, own in config.own_models.items():
+        models = []
+        for index in range(own.n_models):
+            part = f"{variant}/{index}/"
+            vaes = [
+                make_vae(_part(tensors, f"{part}{agent}/"), size, config.hidden, latent, f"{where}: {part}{agent}")
+                for agent, size in (("human", WINDOW * HUMAN_FEATURES), ("robot", robot_input))
+            ]
+            hmms = {a: _read_hmm(tensors, f"{part}hmm/{a}", states, 2 * latent, where) for a in config.actions}
+            context = own.layout.size(latent)
+            regressions = {
+                a: _read_regression(tensors, f"{part}regression/{a}", states, latent, context, where)
+                for a in config.actions
+            }
+            models.append(InteractionModel(vaes[0], hmms, vaes[1], own.layout, regressions))
+        result[variant] = tuple(models)
+    return result
+
+
+def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
@@ -182,38 +242,67 @@ def load_checkpoint(path: Path) -> Checkpoint:
         name=config.name,
         dataset=config.dataset,
         dataset_checksum=config.dataset_checksum,
-        human_vae=make_vae(part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
-        hmms={action: _read_hmm(tensors, action, config.n_states, 2 * latent, str(file)) for action in config.actions},
+        human_vae=make_vae(_part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
+        hmms={
+            action: _read_hmm(tensors, f"hmm/{action}", config.n_states, 2 * latent, str(file))
+            for action in config.actions
+        },
         robot_vaes={
-            name: make_vae(part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
-            for name in config.variants
+            name: make_vae(_part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
+            for name in config.robot_variants
         },
         robot=robot,
+        own_models=_read_own_models(tensors, config, robot_input, str(file)),
+        rate=config.rate,
         contact_states=config.contact_states,
+        own_contact_states=config.own_contact_states,
         placement=config.placement,
         hidden=hidden,
         training=config.training,
         metrics=config.metrics,
     )
-    return replace(checkpoint, contact_states={**config.contact_states, **_read_contact_states(checkpoint)})
+    return _with_saved_states(checkpoint)
 
 
-def _read_contact_states(checkpoint: Checkpoint) -> dict[str, frozenset[int]]:
-    """The states that a person saved, if any."""
+def _read_contact_states(checkpoint: Checkpoint) -> tuple[dict[str, frozenset[int]], dict[str, Any]]:
+    """The states that a person saved, of the shared HMMs by action, and of a variant's own by variant and action."""
     file = checkpoint.path / CONTACT_STATES
     if not file.is_file():
-        return {}
-    return parse_contact_states(read_json(file), checkpoint.actions, checkpoint.n_states, str(file))
+        return {}, {}
+    content = read_json(file)
+    own = {}
+    if isinstance(content, dict):
+        own = {name: content.pop(name) for name in list(content) if name in checkpoint.own_models}
+    actions, states = checkpoint.actions, checkpoint.n_states
+    shared = parse_contact_states(content, actions, states, str(file))
+    return shared, {v: parse_contact_states(t, actions, states, f"{file}: {v}") for v, t in own.items()}
 
 
-def save_contact_states(checkpoint: Checkpoint, action: str, states: frozenset[int]) -> Checkpoint:
+def _with_saved_states(checkpoint: Checkpoint) -> Checkpoint:
+    """The checkpoint with what a person saved in the place of its own defaults."""
+    shared, own = _read_contact_states(checkpoint)
+    before = checkpoint.own_contact_states
+    return replace(
+        checkpoint,
+        contact_states={**checkpoint.contact_states, **shared},
+        own_contact_states={**before, **{v: {**before.get(v, {}), **table} for v, table in own.items()}},
+    )
+
+
+def save_contact_states(checkpoint: Checkpoint, variant: str, action: str, states: frozenset[int]) -> Checkpoint:
     """Make `states` the default contact states of an action, in the checkpoint's own small JSON file.
 
-    Weights and config.json are never touched. Returns the checkpoint with the new default.
+    They hold for all variants that share the HMMs, or for the one that has its own. Weights and config.json are never
+    touched. Returns the checkpoint with the new default.
     """
     check_states(states, action, checkpoint.actions, checkpoint.n_states, f"checkpoint {checkpoint.name}")
-    saved = {**_read_contact_states(checkpoint), action: states}
-    file = checkpoint.path / CONTACT_STATES
-    text = json.dumps({key: sorted(value) for key, value in saved.items()}, indent=2) + "\n"
-    write_atomically(file, lambda temporary: temporary.write_text(text))
-    return replace(checkpoint, contact_states={**checkpoint.contact_states, action: states})
+    choose(f"checkpoint {checkpoint.name}: variant", variant, checkpoint.variants)
+    shared, own = _read_contact_states(checkpoint)
+    if variant in checkpoint.own_models:
+        own = {**own, variant: {**own.get(variant, {}), action: states}}
+    else:
+        shared = {**shared, action: states}
+    content = states_as_json(shared) | {name: states_as_json(table) for name, table in own.items()}
+    text = json.dumps(content, indent=2) + "\n"
+    write_atomically(checkpoint.path / CONTACT_STATES, lambda temporary: temporary.write_text(text))
+    return _with_saved_states(checkpoint)

@@ -24,7 +24,7 @@ from scipy.special import expit
 
 from mild_viz.checkpoint import CONFIG, Checkpoint, RobotInterface, load_checkpoint
 from mild_viz.checkpoint.config import SCHEMA_VERSION, parse_robot, read_json
-from mild_viz.checkpoint.folder import WEIGHTS, load_tensors, part, save_folder
+from mild_viz.checkpoint.folder import WEIGHTS, load_tensors, save_folder
 from mild_viz.errors import UserError
 from mild_viz.latent.vae import VAE, checked_tensors, make_vae
 from mild_viz.pairs import Windows
@@ -97,6 +97,8 @@ class Buetepage:
     """Of the predicted partner."""
     tensors: Mapping[str, Float[np.ndarray, "..."]]
     """Weights of the dynamics by name, as `dynamics_shapes` lists them."""
+    rate: float
+    """Frames a second of the trials that it was trained on [Hz]."""
     training: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
@@ -190,12 +192,12 @@ def save_buetepage(model: Buetepage, path: Path, readme: str) -> Buetepage:
         "dataset": {"name": model.dataset, "checksum": model.dataset_checksum},
         "actions": list(model.actions),
         "robot": asdict(model.robot) if model.robot else None,
+        "rate": model.rate,
         "training": dict(model.training),
         "metrics": dict(model.metrics),
     }
     tensors = {f"vae/{name}": value for name, value in model.vae.weights.items()}
-    tensors |= {f"dynamics/{name}": value for name, value in model.tensors.items()}
-    tensors = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    tensors = {name: np.ascontiguousarray(value) for name, value in (tensors | dict(model.tensors)).items()}
     return replace(save_folder(path, tensors, config, readme, load_buetepage), path=path)
 
 
@@ -203,6 +205,7 @@ CONFIG_FIELDS = {
     "name": (str, "a text"),
     "dataset": (dict, "an object {...}"),
     "actions": (list, "a list [...]"),
+    "rate": (float, "a number of frames a second, such as 30.0"),
     "training": (dict, "an object {...}"),
     "metrics": (dict, "an object {...}"),
 }
@@ -233,6 +236,7 @@ def load_buetepage(path: Path) -> Buetepage:
     robot = parse_robot(config.get("robot"), f"{file}: robot")
     weights = path / WEIGHTS
     tensors = load_tensors(weights)
+    of_vae = {name.removeprefix("vae/"): tensor for name, tensor in tensors.items() if name.startswith("vae/")}
     n_joints = len(robot.joint_names) if robot else None
     input_size = WINDOW * (HUMAN_FEATURES if n_joints is None else n_joints)
     return Buetepage(
@@ -242,10 +246,9 @@ def load_buetepage(path: Path) -> Buetepage:
         dataset_checksum=config["dataset"]["checksum"],
         actions=actions,
         robot=robot,
-        vae=make_vae(part(tensors, "vae/"), input_size, VAE_HIDDEN, LATENT_SIZE, f"{weights}: vae"),
-        tensors=checked_tensors(
-            part(tensors, "dynamics/"), dynamics_shapes(len(actions), n_joints), f"{weights}: dynamics"
-        ),
+        vae=make_vae(of_vae, input_size, VAE_HIDDEN, LATENT_SIZE, f"{weights}: vae"),
+        tensors=checked_tensors(tensors, dynamics_shapes(len(actions), n_joints), str(weights)),
+        rate=config["rate"],
         training=config["training"],
         metrics=config["metrics"],
     )

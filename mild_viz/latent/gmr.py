@@ -58,9 +58,26 @@ def condition(
     if not seen.all():
         means[~seen] = hmm.emission_means[:, size:]
         within[~seen] = _mix(weights[~seen], hmm.emission_covariances[:, size:, size:])
+    return _moments(weights, means, within)
+
+
+def mix_states(
+    weights: Float[np.ndarray, "N S"], means: Float[np.ndarray, "N S R"], covariances: Float[np.ndarray, "N S R R"]
+) -> tuple[Float[np.ndarray, "N R"], Float[np.ndarray, "N R R"]]:
+    """Mean and covariance of a mixture of Gaussians, for every step (Eqs. gmr-conditioning-mu-t and -sigma-t)."""
+    within = (weights[:, None, :] @ covariances.reshape(*weights.shape, -1)).reshape(covariances[:, 0].shape)
+    return _moments(weights, means, within)
+
+
+def _moments(
+    weights: Float[np.ndarray, "N S"], means: Float[np.ndarray, "N S R"], within: Float[np.ndarray, "N R R"]
+) -> tuple[Float[np.ndarray, "N R"], Float[np.ndarray, "N R R"]]:
+    """Mean and covariance of a mixture from the states' means and the mean of their covariances.
+
+    The spread of the means is taken about their mixture mean: the same number as the difference of second moments
+    in Eq. gmr-conditioning-sigma-t, without its cancellation.
+    """
     mean = (weights[:, None, :] @ means)[:, 0]
-    # Eq. gmr-conditioning-sigma-t, with the spread of the means taken about their mixture mean: the same
-    # number as the difference of second moments, without its cancellation.
     spread = means - mean[:, None, :]
     covariance = within + (weights[..., None] * spread).transpose(0, 2, 1) @ spread
     return mean, 0.5 * (covariance + covariance.transpose(0, 2, 1))

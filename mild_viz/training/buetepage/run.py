@@ -64,11 +64,12 @@ def train_buetepage(
     source = load_dataset(dataset)
     robot = None if human_human else robot_shown(source.train)
     fit, held = hold_out(source.train, options.held_out)
+    actions = tuple(action for action in source.actions if any(trial.action == action for trial in fit))
     started = time.monotonic()
     with one_thread(), _bars(options.epochs) as progress:
-        trained = train_models(fit, source.actions, robot, options, progress)
+        trained = train_models(fit, actions, robot, options, progress)
     candidates = [
-        Buetepage(out, out.name, source.name, source.checksum, source.actions, robot, vae, tensors)
+        Buetepage(out, out.name, source.name, source.checksum, actions, robot, vae, tensors, rate=float(fit[0].rate))
         for vae, tensors in trained
     ]
     scores = [mean_error(model_rows(candidate, held), BUETEPAGE) for candidate in candidates] if held else []
@@ -88,7 +89,8 @@ def train_buetepage(
         "options": asdict(options),
     }
     # The test split is read here for the first time, for the record only.
-    tests = [[row.as_dict() for row in model_rows(candidate, source.test)] for candidate in candidates]
+    test = [trial for trial in source.test if trial.action in actions]
+    tests = [[row.as_dict() for row in model_rows(candidate, test)] for candidate in candidates]
     metrics = {"held_out": scores, "test": tests[best], "test_seeds": tests}
     chosen = replace(candidates[best], training=training, metrics=metrics)
     return save_buetepage(chosen, out, _readme(chosen, source))
