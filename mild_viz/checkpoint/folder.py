@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +25,7 @@ from mild_viz.checkpoint.config import (
 )
 from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.errors import UserError
-from mild_viz.files import write_atomically
+from mild_viz.files import replace_folder, write_atomically
 from mild_viz.latent.context import ContextRegression
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.interaction import InteractionModel
@@ -115,35 +112,21 @@ def save_folder(
             then as it was.
     """
     check_checkpoint_target(path)
-    try:
-        target = path.resolve()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name[:50]}.", dir=target.parent))
-        built, old = work / "new", work / "old"
+
+    def fill(built: Path) -> Model:
         try:
-            built.mkdir()
             save_file(tensors, built / WEIGHTS)
-            (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
-            (built / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-            (built / README).write_text(readme, encoding="utf-8", errors="replace")
-            try:
-                loaded = load(built)
-            except UserError as error:
-                raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
-            if target.exists():
-                os.replace(target, old)
-            try:
-                os.replace(built, target)
-            except OSError:
-                if old.exists():
-                    os.replace(old, target)
-                raise
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except (OSError, SafetensorError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path} cannot be written: {reason}; choose another place") from None
-    return loaded
+        except SafetensorError as error:
+            raise UserError(f"{path} cannot be written: {error}; choose another place") from None
+        (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
+        (built / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        (built / README).write_text(readme, encoding="utf-8", errors="replace")
+        try:
+            return load(built)
+        except UserError as error:
+            raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
+
+    return replace_folder(path, fill)
 
 
 def load_tensors(file: Path) -> dict[str, np.ndarray]:
