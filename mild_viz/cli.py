@@ -32,7 +32,7 @@ def app(
     action: OptionalText = None,
     trial: OptionalInt = None,
     variant: OptionalVariant = None,
-    robot: str = "pepper",
+    robot: OptionalText = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -45,7 +45,7 @@ def app(
     Args:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset, that is checkpoints/demo
             for demo, checkpoints/nuisi-pepper for nuisi. Example: --checkpoint checkpoints/nuisi-pepper
-        dataset: Recordings to open: demo (built in), nuisi, yumi, handover (see: mild-viz data list).
+        dataset: Recordings to open: demo (built in), nuisi, yumi, handover, buetepage (see: mild-viz data list).
             Example: --dataset nuisi
         action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the handshake, if
             dataset and model have it, else their first one. Example: --action rocket
@@ -53,8 +53,9 @@ def app(
             Example: --trial 5
         variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
             has the table). Default: v3.1, if the model has it. Example: --variant v2.1
-        robot: Robot to control: pepper, or the path of a URDF file with the joints that the model drives; meshes
-            named package://... are looked up beside the file. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file with the joints that the model
+            drives; meshes named package://... are looked up beside the file. Default: the robot that the model was
+            trained for. Example: --robot ~/pepper.urdf
         host: Network address to listen on. There is no password: leave it at this machine's own address unless
             everybody on the network may use the page. Example: --host 0.0.0.0
         port: TCP port to listen on. Example: --port 9000
@@ -122,6 +123,7 @@ def train(
     epochs: OptionalInt = None,
     seed: int = 0,
     resume: bool = False,
+    state_model: Literal["hmm", "hsmm"] = "hmm",
 ) -> None:
     """Train a model: Algorithms 1 and 2 of the paper.
 
@@ -140,15 +142,16 @@ def train(
         epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
         seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
         resume: Go on from the state in --out, where an earlier run was interrupted.
+        state_model: Kind of state model: hmm, or hsmm with Gaussian durations of states. Example: --state-model hsmm
     """
     from mild_viz.training.run import train as run
 
-    out = out or Path("runs") / f"{dataset}-{stage}"
     made = run(
-        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, out=out, resume=resume, seed=seed
-    )
-    print(f"{out}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
-    print(f"next: mild-viz evaluate --checkpoint {out} --dataset {dataset}")
+        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, resume=resume, seed=seed,
+        out=out or Path("runs") / f"{dataset}-{stage}", state_model=state_model,
+    )  # fmt: skip
+    print(f"{made.path}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
+    print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {dataset}")
 
 
 def evaluate(
@@ -164,7 +167,7 @@ def evaluate(
 
     Args:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
         json: File for the table, as a list of rows. Default: print only. Example: --json results.json
     """
     if json is not None:

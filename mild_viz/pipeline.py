@@ -16,6 +16,7 @@ from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
+from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import robot_truth
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
@@ -67,6 +68,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         log_alpha_joint=joint_log_alpha(model, trial.action, said.human_mean, latent_truth),
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),
         active_state=said.log_alpha.argmax(1),
+        log_transition=said.log_transition,
         human_latent_mean=said.human_mean,
         human_latent_covariance=(said.human_std**2)[:, :, None] * np.eye(size),
         robot_latent_mean=said.robot_mean,
@@ -101,6 +103,7 @@ def control(
 ) -> Rollout:
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
+    transition = checkpoint.transition_state_of(inference.variant, inference.action)
     placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
     target = in_frame(placed.T_world_human, inference.human_hand)
     result = run_controller(
@@ -111,6 +114,7 @@ def control(
         inference.joints_decoded,
         target,
         initial_carry(robot.chain),
+        inference.log_transition if uses_transition(settings, transition) else None,
     )
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
@@ -146,6 +150,11 @@ def with_contact_states(
     if bad:
         raise UserError(f"contact states {bad} do not exist; valid: 0 to {checkpoint.n_states - 1}")
     return settings
+
+
+def uses_transition(settings: ControlSettings, transition: TransitionState | None) -> bool:
+    """Whether a controller uses a transition state: only if it leads to the contact states that are chosen."""
+    return transition is not None and transition.contact_states == settings.contact_states
 
 
 def state_visits(

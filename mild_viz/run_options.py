@@ -63,7 +63,7 @@ class RunOptions:
 
     Attributes:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
         variant: Variant of MILD. Example: --variant v2.1
@@ -80,7 +80,8 @@ class RunOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, or the path of a URDF file. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. Default: the robot that the model
+            was trained for. Example: --robot ~/pepper.urdf
     """
 
     checkpoint: OptionalPath = None
@@ -95,7 +96,7 @@ class RunOptions:
     smoothing: float = 0.8
     stiffness: bool = True
     placement: OptionalPosition = None
-    robot: str = "pepper"
+    robot: OptionalText = None
 
     def run(self) -> tuple[Rollout, RobotModel]:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
@@ -117,5 +118,5 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = load_robot(self.robot, interface.joint_names, interface.end_effector)
+        robot = load_robot(self.robot or interface.name, interface.joint_names, interface.end_effector)
         return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings), robot

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
-from mild_viz.pipeline import with_contact_states
+from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
@@ -31,6 +31,7 @@ class StreamModel:
     action: str
     robot: RobotModel
     settings: ControlSettings
+    uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
     rate: float
     """Observations a second [Hz]."""
@@ -58,6 +59,7 @@ class Command(NamedTuple):
     """The answer to one observation; `None` fields until the first window is full."""
 
     log_alpha: Float[np.ndarray, " S"]
+    log_transition: float
     active_state: int
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
@@ -79,12 +81,14 @@ def stream_model(
 ) -> StreamModel:
     """Everything that a stream of observations at `rate` [Hz] needs."""
     choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
+    settings = with_contact_states(settings, checkpoint, variant, action)
     return StreamModel(
         models=checkpoint.members(variant),
         variant=variant,
         action=action,
         robot=robot,
-        settings=with_contact_states(settings, checkpoint, variant, action),
+        settings=settings,
+        uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,
         max_gap=max_gap(rate),
@@ -113,11 +117,13 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     decoded = said.decoded[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     target = in_frame(model.T_world_human, hand[None])
+    log_transition = said.log_transition if model.uses_transition else None
     result = run_controller(
-        model.robot.chain, model.settings, model.action, said.log_alpha, decoded, target, seen.control
+        model.robot.chain, model.settings, model.action, said.log_alpha, decoded, target, seen.control, log_transition
     )
     command = Command(
         log_alpha=said.log_alpha[0],
+        log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],

@@ -17,9 +17,7 @@ from mild_viz.latent.hmm import (
     check_hmm,
     forward_filter,
     log_emission,
-    smooth,
     unobserved_forward,
-    viterbi_path,
 )
 from tests.models import random_hmm
 
@@ -69,7 +67,7 @@ def test_forward_filter_sums_over_all_paths(example: tuple[HMM, np.ndarray]) -> 
 
 def test_smoother_sums_over_all_paths(example: tuple[HMM, np.ndarray]) -> None:
     hmm, z = example
-    log_gamma = smooth(hmm, log_emission(hmm, z))
+    log_gamma = hmm.smooth(log_emission(hmm, z))
     paths = path_log_probabilities(hmm, z)
     total = np.logaddexp.reduce(list(paths.values()))
     for n in range(len(z)):
@@ -80,7 +78,7 @@ def test_smoother_sums_over_all_paths(example: tuple[HMM, np.ndarray]) -> None:
 
 def test_viterbi_finds_the_best_of_all_paths(example: tuple[HMM, np.ndarray]) -> None:
     hmm, z = example
-    path, score = viterbi_path(hmm, log_emission(hmm, z))
+    path, score = hmm.viterbi(log_emission(hmm, z))
     paths = path_log_probabilities(hmm, z)
     best = max(paths, key=lambda p: paths[p])
     assert tuple(path) == best
@@ -91,8 +89,8 @@ def test_filter_continues_from_the_previous_step(example: tuple[HMM, np.ndarray]
     hmm, z = example
     likelihood = log_emission(hmm, z)
     whole, _ = forward_filter(hmm, likelihood)
-    head, _ = forward_filter(hmm, likelihood[:3])
-    tail, _ = forward_filter(hmm, likelihood[3:], previous=head[-1])
+    head, _, carry = hmm.filter(likelihood[:3])
+    tail, _, _ = hmm.filter(likelihood[3:], carry)
     np.testing.assert_allclose(np.concatenate([head, tail]), whole, atol=1e-12)
 
 
@@ -110,7 +108,7 @@ def test_alpha_sums_to_one_even_far_from_every_state(seed: int, spread: float) -
     z = spread * rng.normal(size=(30, 3))
     log_alpha, total = forward_filter(hmm, log_emission(hmm, z))
     np.testing.assert_allclose(np.exp(log_alpha).sum(1), 1.0, atol=1e-12)
-    np.testing.assert_allclose(np.exp(smooth(hmm, log_emission(hmm, z))).sum(1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.exp(hmm.smooth(log_emission(hmm, z))).sum(1), 1.0, atol=1e-12)
     assert np.isfinite(total)
 
 

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from mild_viz.checkpoint.model import Checkpoint, RobotInterface
 from mild_viz.errors import UserError
 from mild_viz.latent.context import ContextLayout
+from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
 from mild_viz.trial import ACTIONS
 
@@ -41,6 +42,7 @@ class Config:
     hidden: tuple[int, int]
     latent_size: int
     n_states: int
+    state_model: str
     actions: tuple[str, ...]
     robot: RobotInterface | None
     rate: float | None
@@ -64,6 +66,7 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "hidden": list(checkpoint.hidden),
         "latent_size": checkpoint.human_vae.latent_size,
         "n_states": checkpoint.n_states,
+        "state_model": checkpoint.state_model,
         "actions": list(checkpoint.actions),
         "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
         "rate": checkpoint.rate,
@@ -146,6 +149,10 @@ def parse_contact_states(value: Any, actions: Sequence[str], n_states: int, wher
         result[action] = frozenset(states)
         check_states(result[action], action, actions, n_states, where)
     return result
+
+
+def _state_model(value: Any, where: str) -> str:
+    return choose(where, _typed(value, str, where), list(STATE_MODELS))
 
 
 def parse_robot(value: Any, where: str) -> RobotInterface | None:
@@ -264,6 +271,7 @@ def read_config(file: Path) -> Config:
         hidden=(_size(hidden[0], f"{file}: hidden"), _size(hidden[1], f"{file}: hidden")),
         latent_size=_size(config["latent_size"], f"{file}: latent_size"),
         n_states=n_states,
+        state_model=_state_model(config.get("state_model", "hmm"), f"{file}: state_model"),
         actions=actions,
         robot=robot,
         rate=_rate(config.get("rate"), f"{file}: rate"),

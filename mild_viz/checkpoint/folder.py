@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +14,6 @@ from safetensors.numpy import load_file, save_file
 
 from mild_viz.checkpoint.config import (
     SCHEMA_VERSION,
-    Config,
     check_states,
     config_of,
     is_config,
@@ -24,43 +23,15 @@ from mild_viz.checkpoint.config import (
     states_as_json,
 )
 from mild_viz.checkpoint.model import Checkpoint
+from mild_viz.checkpoint.tensors import read_parts, tensors_of
 from mild_viz.errors import UserError
 from mild_viz.files import replace_folder, write_atomically
-from mild_viz.latent.context import ContextRegression
-from mild_viz.latent.hmm import HMM, check_hmm
-from mild_viz.latent.interaction import InteractionModel
-from mild_viz.latent.vae import VAE, make_vae
-from mild_viz.settings import HUMAN_FEATURES, WINDOW, choose
+from mild_viz.settings import choose
 
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
 FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
 
 Model = TypeVar("Model")
-
-
-def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    """Everything by name. Networks in single precision, in which they were trained; the rest in double."""
-    tensors = _vae_tensors("human/", checkpoint.human_vae) | _hmm_tensors("hmm/", checkpoint.hmms)
-    for variant, vae in checkpoint.robot_vaes.items():
-        tensors |= _vae_tensors(f"robot/{variant}/", vae)
-    for variant, models in checkpoint.own_models.items():
-        for index, model in enumerate(models):
-            part = f"{variant}/{index}/"
-            tensors |= _vae_tensors(f"{part}human/", model.human_vae) | _vae_tensors(f"{part}robot/", model.robot_vae)
-            tensors |= _hmm_tensors(f"{part}hmm/", model.hmms)
-            for action, regression in model.regressions.items():
-                for name in ContextRegression.__dataclass_fields__:
-                    tensors[f"{part}regression/{action}/{name}"] = getattr(regression, name)
-    return {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-
-
-def _vae_tensors(part: str, vae: VAE) -> dict[str, np.ndarray]:
-    return {f"{part}{name}": value.astype(np.float32) for name, value in vae.weights.items()}
-
-
-def _hmm_tensors(part: str, hmms: Mapping[str, HMM]) -> dict[str, np.ndarray]:
-    names = HMM.__dataclass_fields__
-    return {f"{part}{action}/{name}": getattr(hmm, name) for action, hmm in hmms.items() for name in names}
 
 
 def check_checkpoint_target(out: Path) -> None:
@@ -94,7 +65,7 @@ def check_checkpoint_target(out: Path) -> None:
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoint:
     """Write a checkpoint's folder, and return it as loaded from there. See `save_folder` for its errors."""
-    loaded = save_folder(path, _tensors(checkpoint), config_of(checkpoint), readme, load_checkpoint)
+    loaded = save_folder(path, tensors_of(checkpoint), config_of(checkpoint), readme, load_checkpoint)
     return replace(loaded, path=path)
 
 
@@ -139,67 +110,6 @@ def load_tensors(file: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
 
 
-def _checked(tensors: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """A tensor in double precision, or an error that names it, its shape and the expected one."""
-    if name not in tensors:
-        raise UserError(f"{where}: tensor '{name}' is missing")
-    if tensors[name].shape != shape:
-        raise UserError(f"{where}: tensor '{name}' has shape {tensors[name].shape}, expected {shape}")
-    return tensors[name].astype(np.float64)
-
-
-def _read_hmm(tensors: Mapping[str, np.ndarray], key: str, n_states: int, size: int, where: str) -> HMM:
-    shapes = {
-        "initial_probs": (n_states,), "transition_matrix": (n_states, n_states),
-        "emission_means": (n_states, size), "emission_covariances": (n_states, size, size),
-    }  # fmt: skip
-    values = {name: _checked(tensors, f"{key}/{name}", shape, where) for name, shape in shapes.items()}
-    return check_hmm(HMM(**values), f"{where}: {key}")
-
-
-def _read_regression(
-    tensors: Mapping[str, np.ndarray], key: str, n_states: int, latent: int, context: int, where: str
-) -> ContextRegression:
-    shapes = {
-        "gain": (n_states, latent, context), "offset": (n_states, latent), "covariance": (n_states, latent, latent)
-    }  # fmt: skip
-    values = {name: _checked(tensors, f"{key}/{name}", shape, where) for name, shape in shapes.items()}
-    for name, value in values.items():
-        if not np.isfinite(value).all():
-            raise UserError(f"{where}: tensor '{key}/{name}' has values that are not finite")
-    if not np.linalg.eigvalsh(values["covariance"]).min() > 0.0:
-        raise UserError(f"{where}: tensor '{key}/covariance' is not positive definite")
-    return ContextRegression(**values)
-
-
-def _read_own_models(
-    tensors: Mapping[str, np.ndarray], config: Config, robot_input: int, where: str
-) -> dict[str, tuple[InteractionModel, ...]]:
-    """The models of the variants that have their own."""
-    latent, states, result = config.latent_size, config.n_states, {}
-    for variant, own in config.own_models.items():
-        models = []
-        for index in range(own.n_models):
-            part = f"{variant}/{index}/"
-            vaes = [
-                make_vae(_part(tensors, f"{part}{agent}/"), size, config.hidden, latent, f"{where}: {part}{agent}")
-                for agent, size in (("human", WINDOW * HUMAN_FEATURES), ("robot", robot_input))
-            ]
-            hmms = {a: _read_hmm(tensors, f"{part}hmm/{a}", states, 2 * latent, where) for a in config.actions}
-            context = own.layout.size(latent)
-            regressions = {
-                a: _read_regression(tensors, f"{part}regression/{a}", states, latent, context, where)
-                for a in config.actions
-            }
-            models.append(InteractionModel(vaes[0], hmms, vaes[1], own.layout, regressions))
-        result[variant] = tuple(models)
-    return result
-
-
-def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint's folder; every tensor is checked against config.json.
 
@@ -217,30 +127,23 @@ def load_checkpoint(path: Path) -> Checkpoint:
             "as written by `mild-viz train` or `mild-viz import-published`"
         )
     config = read_config(config_file)
-    tensors = load_tensors(file)
-    hidden, latent, robot = config.hidden, config.latent_size, config.robot
-    robot_input = WINDOW * (len(robot.joint_names) if robot else HUMAN_FEATURES)
+    parts = read_parts(load_tensors(file), config, str(file))
     checkpoint = Checkpoint(
         path=path,
         name=config.name,
         dataset=config.dataset,
         dataset_checksum=config.dataset_checksum,
-        human_vae=make_vae(_part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
-        hmms={
-            action: _read_hmm(tensors, f"hmm/{action}", config.n_states, 2 * latent, str(file))
-            for action in config.actions
-        },
-        robot_vaes={
-            name: make_vae(_part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
-            for name in config.robot_variants
-        },
-        robot=robot,
-        own_models=_read_own_models(tensors, config, robot_input, str(file)),
+        human_vae=parts.human_vae,
+        hmms=parts.hmms,
+        robot_vaes=parts.robot_vaes,
+        robot=config.robot,
+        own_models=parts.own_models,
         rate=config.rate,
         contact_states=config.contact_states,
         own_contact_states=config.own_contact_states,
+        transition_states=parts.transition_states,
         placement=config.placement,
-        hidden=hidden,
+        hidden=config.hidden,
         training=config.training,
         metrics=config.metrics,
     )

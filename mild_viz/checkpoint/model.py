@@ -11,6 +11,8 @@ from typing import Any
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM
 from mild_viz.latent.interaction import InteractionModel
+from mild_viz.latent.state_models import state_model_of
+from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
 from mild_viz.settings import VARIANTS, Placement, choose
 
@@ -48,6 +50,8 @@ class Checkpoint:
     """States in which the partners touch, by action, of the shared HMMs."""
     own_contact_states: Mapping[str, Mapping[str, frozenset[int]]] = field(default_factory=dict)
     """The same by variant and action, where a variant has HMMs of its own."""
+    transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
+    """Where reaching turns into contact, by action, in the latents that the variants share."""
     placement: Placement | None = None
     hidden: tuple[int, int] = (40, 20)
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -68,6 +72,11 @@ class Checkpoint:
     def n_states(self) -> int:
         return next(iter(self.hmms.values())).n_states
 
+    @property
+    def state_model(self) -> str:
+        """The kind of the hidden-state models, a name in `STATE_MODELS`."""
+        return state_model_of(next(iter(self.hmms.values())))
+
     def hmm(self, action: str) -> HMM:
         choose(f"checkpoint {self.name}: action", action, self.actions)
         return self.hmms[action]
@@ -82,12 +91,20 @@ class Checkpoint:
     @cached_property
     def _shared(self) -> dict[str, InteractionModel]:
         vaes = self.robot_vaes if self.robot is not None else {"v1": self.human_vae}
-        return {name: InteractionModel(self.human_vae, self.hmms, vae) for name, vae in vaes.items()}
+        transitions = self.transition_states
+        return {
+            name: InteractionModel(self.human_vae, self.hmms, vae, transition_states=transitions)
+            for name, vae in vaes.items()
+        }
 
     def contact_states_of(self, variant: str, action: str) -> frozenset[int]:
         """States in which the partners touch, by the model's default; empty where none are known."""
         own = VARIANTS[variant].own_models
         return (self.own_contact_states.get(variant, {}) if own else self.contact_states).get(action, frozenset())
+
+    def transition_state_of(self, variant: str, action: str) -> TransitionState | None:
+        """The transition state that a controller may use; None where there is none."""
+        return self.members(variant)[0].transition_states.get(action)
 
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""

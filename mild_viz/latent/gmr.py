@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mild_viz.latent import kernels
 from mild_viz.latent.hmm import HMM, observed_rows
 
 
@@ -87,15 +88,13 @@ def _condition_on_posterior(
     hmm: HMM, human_mean: Float[np.ndarray, "N H"], human_std: Float[np.ndarray, "N H"]
 ) -> tuple[Float[np.ndarray, "N S R"], Float[np.ndarray, "N S R R"]]:
     """Conditional mean and covariance of every state (Eqs. conditioning-withcov-K-i and -mu-i); NaN where not seen."""
-    size = human_mean.shape[1]
-    mean_h, mean_r = hmm.emission_means[:, :size], hmm.emission_means[:, size:]
-    cov_rh = hmm.emission_covariances[:, size:, :size]
-    cov_hr = cov_rh.transpose(0, 2, 1)
-    posterior = human_std[:, None, :, None] ** 2 * np.eye(size)
-    innovation = hmm.emission_covariances[:, :size, :size] + posterior  # N S H H
-    gain = np.linalg.solve(innovation, np.broadcast_to(cov_hr, (len(human_mean), *cov_hr.shape))).swapaxes(2, 3)
-    means = mean_r + (gain @ (human_mean[:, None, :] - mean_h)[..., None])[..., 0]
-    return means, hmm.emission_covariances[:, size:, size:] - gain @ cov_hr
+    robot_size = hmm.emission_means.shape[1] - human_mean.shape[1]
+    means = np.empty((len(human_mean), hmm.n_states, robot_size))
+    covariances = np.empty((*means.shape, robot_size))
+    kernels.condition_states(
+        np.ascontiguousarray(human_mean), human_std**2, hmm.emission_means, hmm.emission_covariances, means, covariances
+    )
+    return means, covariances
 
 
 def _mix(weights: Float[np.ndarray, "N S"], covariances: Float[np.ndarray, "S R R"]) -> Float[np.ndarray, "N R R"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,10 @@ def safe_log(probabilities: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."
     """Logarithm that maps 0 to -inf without a warning."""
     with np.errstate(divide="ignore"):
         return np.log(probabilities)
+
+
+FilterCarry = Float[np.ndarray, "S *elapsed"]
+"""What a filter leaves to the next step: log probabilities of the states, in a model with durations by elapsed time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,19 +58,48 @@ class HMM:
 
     def marginal(self, dimensions: slice) -> HMM:
         """The model of some of the latent dimensions alone."""
-        return HMM(
-            self.initial_probs,
-            self.transition_matrix,
-            self.emission_means[:, dimensions],
-            self.emission_covariances[:, dimensions, dimensions],
+        return replace(
+            self,
+            emission_means=self.emission_means[:, dimensions],
+            emission_covariances=self.emission_covariances[:, dimensions, dimensions],
         )
+
+    def filter(
+        self, log_likelihood: Float[np.ndarray, "N S"], carry: FilterCarry | None = None
+    ) -> tuple[Float[np.ndarray, "N S"], float, FilterCarry]:
+        """Normalised forward variable log alpha (Eq. hmm-h), log p(z_{1:N}), and what the next call goes on from.
+
+        `carry` is what an earlier call returned: the recursion goes on after its last step.
+        """
+        if carry is None:
+            log_prior = safe_log(self.initial_probs)
+        else:
+            log_prior = np.logaddexp.reduce(carry[:, None] + self.log_transition, axis=0)
+        log_alpha = np.empty(log_likelihood.shape)
+        total = kernels.forward(log_prior, self.log_transition, np.ascontiguousarray(log_likelihood), log_alpha)
+        return log_alpha, float(total), log_alpha[-1]
+
+    def smooth(self, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "N S"]:
+        """log p(state at n given z_{1:N}), by forward-backward."""
+        log_alpha, _, _ = self.filter(log_likelihood)
+        log_beta = np.empty_like(log_alpha)
+        kernels.backward(self.log_transition, np.ascontiguousarray(log_likelihood), log_beta)
+        log_gamma = log_alpha + log_beta
+        return log_gamma - np.logaddexp.reduce(log_gamma, axis=1, keepdims=True)
+
+    def viterbi(self, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
+        """Most likely state sequence, and its joint log probability with the observations."""
+        path = np.empty(len(log_likelihood), dtype=np.int64)
+        log_prior = safe_log(self.initial_probs)
+        score = kernels.viterbi(log_prior, self.log_transition, np.ascontiguousarray(log_likelihood), path)
+        return path, float(score)
 
 
 def check_hmm(hmm: HMM, where: str) -> HMM:
     """Return `hmm` if it is a valid model, else raise an error that says what is wrong."""
-    for name in HMM.__dataclass_fields__:
-        if not np.isfinite(getattr(hmm, name)).all():
-            raise UserError(f"{where}: {name} has values that are not finite")
+    for field in fields(hmm):
+        if not np.isfinite(getattr(hmm, field.name)).all():
+            raise UserError(f"{where}: {field.name} has values that are not finite")
     if (hmm.transition_matrix < 0).any() or not np.allclose(hmm.transition_matrix.sum(1), 1.0, atol=1e-6):
         raise UserError(
             f"{where}: rows of transition_matrix are not probabilities (sums {hmm.transition_matrix.sum(1)})"
@@ -94,52 +127,21 @@ def observed_rows(z: Float[np.ndarray, "N D"]) -> Bool[np.ndarray, " N"]:
 
 def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N S"]:
     """log N(z_n; mu_i, Sigma_i). A row of `z` with NaN is a missing observation and gives a row of zeros."""
-    inverse, offsets, constants = hmm.whitening
-    # One matrix product for all states and steps: D is small and N is large.
-    n_states, size, _ = inverse.shape
-    whitened = (z @ inverse.reshape(n_states * size, size).T).reshape(-1, n_states, size) - offsets
-    log_density = constants - 0.5 * (whitened**2).sum(2)
-    log_density[~observed_rows(z)] = 0.0
+    log_density = np.empty((len(z), hmm.n_states))
+    kernels.log_density(np.ascontiguousarray(z), *hmm.whitening, log_density)
     return log_density
 
 
-def forward_filter(
-    hmm: HMM,
-    log_likelihood: Float[np.ndarray, "N S"],
-    previous: Float[np.ndarray, " S"] | None = None,
-) -> tuple[Float[np.ndarray, "N S"], float]:
-    """Normalised forward variable log alpha (Eq. hmm-h), and log p(z_{1:N}).
+def forward_filter(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Float[np.ndarray, "N S"], float]:
+    """Normalised forward variable log alpha (Eq. hmm-h), and log p(z_{1:N}), of a whole sequence.
 
-    `previous` is log alpha of the step before the first row: a stream continues from it. A row of zeros in
-    `log_likelihood` is a step without an observation; all rows zero give the unobserved forward variable
-    of Eq. vaeHMM-prior.
+    A row of zeros in `log_likelihood` is a step without an observation; all rows zero give the unobserved
+    forward variable of Eq. vaeHMM-prior.
     """
-    log_transition = hmm.log_transition
-    if previous is None:
-        log_prior = safe_log(hmm.initial_probs)
-    else:
-        log_prior = np.logaddexp.reduce(previous[:, None] + log_transition, axis=0)
-    log_alpha = np.empty(log_likelihood.shape)
-    total = kernels.forward(log_prior, log_transition, np.ascontiguousarray(log_likelihood), log_alpha)
-    return log_alpha, float(total)
+    log_alpha, total, _ = hmm.filter(log_likelihood)
+    return log_alpha, total
 
 
 def unobserved_forward(hmm: HMM, n_steps: int) -> Float[np.ndarray, "N S"]:
     """log of the unobserved forward variable (Eq. vaeHMM-prior) for the first `n_steps` steps."""
     return forward_filter(hmm, np.zeros((n_steps, hmm.n_states)))[0]
-
-
-def smooth(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> Float[np.ndarray, "N S"]:
-    """log p(state at n given z_{1:N}), by forward-backward."""
-    log_alpha, _ = forward_filter(hmm, log_likelihood)
-    log_beta = np.empty_like(log_alpha)
-    kernels.backward(hmm.log_transition, np.ascontiguousarray(log_likelihood), log_beta)
-    log_gamma = log_alpha + log_beta
-    return log_gamma - np.logaddexp.reduce(log_gamma, axis=1, keepdims=True)
-
-
-def viterbi_path(hmm: HMM, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
-    """Most likely state sequence, and its joint log probability with the observations."""
-    path = np.empty(len(log_likelihood), dtype=np.int64)
-    score = kernels.viterbi(safe_log(hmm.initial_probs), hmm.log_transition, np.ascontiguousarray(log_likelihood), path)
-    return path, float(score)

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from mild_viz.latent.context import ContextLayout, ContextRegression, condition_on_context
 from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows
+from mild_viz.latent.hmm import HMM, FilterCarry, log_emission, observed_rows
+from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
 
 
@@ -24,6 +25,8 @@ class Prediction(NamedTuple):
     human_std: Float[np.ndarray, "N D"]
     log_alpha: Float[np.ndarray, "N S"]
     """Human-only forward variable (Eq. hmm-h)."""
+    log_transition: Float[np.ndarray, " N"]
+    """log probability of the transition state; -inf without one, and where not observed."""
     robot_mean: Float[np.ndarray, "N D"]
     """Conditional mean of the robot's latent (Eq. conditioning-withcov-mu-t)."""
     robot_covariance: Float[np.ndarray, "N D D"]
@@ -34,7 +37,7 @@ class Prediction(NamedTuple):
 class ModelCarry(NamedTuple):
     """What one window leaves to the next."""
 
-    log_alpha: Float[np.ndarray, " S"] | None
+    filter: FilterCarry | None
     history: Float[np.ndarray, "L D"]
     """The last human latents, gaps filled with the one before; as many as the longest lag, fewer at the beginning."""
     step: int
@@ -54,6 +57,8 @@ class InteractionModel:
     """The partner's: a second human's in a human-human model."""
     layout: ContextLayout = field(default_factory=ContextLayout)
     regressions: Mapping[str, ContextRegression] = field(default_factory=dict)
+    transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
+    """By action; one without it is controlled by the HMM's states alone."""
 
     @cached_property
     def human_hmms(self) -> dict[str, HMM]:
@@ -79,7 +84,11 @@ class InteractionModel:
         """
         hmm, human_hmm = self.hmms[action], self.human_hmms[action]
         mean, std = self.human_vae.encode(human)
-        log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean), carry.log_alpha)
+        likelihood = log_emission(human_hmm, mean)
+        log_alpha, _, filtered = human_hmm.filter(likelihood, carry.filter)
+        log_transition = np.full(len(mean), -np.inf)
+        if action in self.transition_states:
+            log_transition = self.transition_states[action].log_probability(mean, likelihood, log_alpha)
         history = carry.history
         if action in self.regressions:
             filled = _fill_forward(mean, history)
@@ -98,8 +107,8 @@ class InteractionModel:
         else:
             robot_mean, robot_covariance = condition(hmm, mean, log_alpha, std if posterior_covariance else None)
         decoded = self.robot_vae.decode(robot_mean)
-        following = ModelCarry(log_alpha[-1], history, carry.step + len(human))
-        return Prediction(mean, std, log_alpha, robot_mean, robot_covariance, decoded), following
+        following = ModelCarry(filtered, history, carry.step + len(human))
+        return Prediction(mean, std, log_alpha, log_transition, robot_mean, robot_covariance, decoded), following
 
 
 def _fill_forward(z: Float[np.ndarray, "N D"], history: Float[np.ndarray, "L D"]) -> Float[np.ndarray, "N D"]:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mild_viz.latent.em import equal_segments, fit
 from mild_viz.latent.hmm import HMM, unobserved_forward
+from mild_viz.latent.state_models import fit_from_equal_segments
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows
 from mild_viz.training.networks import BatchedVAE, gaussian_kl, standard_kl
@@ -36,13 +36,15 @@ def joint_latents(human: VAE, partner: VAE, data: Windows) -> list[np.ndarray]:
 
 
 def fit_hmms(
-    latents: Sequence[np.ndarray], actions: Sequence[str], n_states: int, floor: float, n_iterations: int
+    latents: Sequence[np.ndarray], actions: Sequence[str], options: TrainingOptions, n_iterations: int
 ) -> dict[str, HMM]:
-    """One HMM per action on the joint latents of its trials, from the equal split in time."""
+    """One model of the chosen kind per action on the joint latents of its trials, from the equal split in time."""
     hmms = {}
     for action in dict.fromkeys(actions):
         sequences = [sequence for sequence, of in zip(latents, actions, strict=True) if of == action]
-        hmms[action], _ = fit(equal_segments(sequences, n_states, floor), sequences, floor, n_iterations)
+        hmms[action] = fit_from_equal_segments(
+            options.state_model, sequences, options.n_states, options.covariance_floor, n_iterations
+        )
     return hmms
 
 
@@ -126,7 +128,7 @@ def train_human_stage(
         for seed in range(options.seeds):
             vae = net.export(seed)
             latents = joint_latents(vae, vae, data)
-            hmms = fit_hmms(latents, data.actions, options.n_states, options.covariance_floor, n_iterations)
+            hmms = fit_hmms(latents, data.actions, options, n_iterations)
             models.append(HumanModel(vae, hmms))
         size, tables = options.latent_size, [model.hmms for model in models]
         return models, [

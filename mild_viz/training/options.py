@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mild_viz.errors import UserError
+from mild_viz.latent.state_models import STATE_MODELS
+from mild_viz.settings import choose
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,8 @@ class TrainingOptions:
     hidden: tuple[int, int] = (40, 20)
     latent_size: int = 5
     n_states: int = 6
+    state_model: str = "hmm"
+    """Kind of the hidden-state model, a name in `STATE_MODELS`."""
     human_epochs: int = 60
     robot_epochs: int = 60
     batch_size: int = 256
@@ -39,5 +43,6 @@ class TrainingOptions:
         for name, most in (("seeds", 256), ("human_epochs", 100_000), ("robot_epochs", 100_000)):
             if not 1 <= getattr(self, name) <= most:
                 raise UserError(f"{name} is {getattr(self, name)}; valid: 1 to {most}")
+        choose("state_model", self.state_model, list(STATE_MODELS))
         if not 0 <= self.seed < 2**31:
             raise UserError(f"seed is {self.seed}; valid: 0 to {2**31 - 1}")

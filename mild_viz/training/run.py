@@ -17,6 +17,7 @@ from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_tar
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.pipeline import NEWEST, infer
@@ -29,6 +30,7 @@ from mild_viz.training.human_stage import complete_rows, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
+from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Dataset, Trial
 
 ROBOT = "pepper"
@@ -82,18 +84,19 @@ def train(
     out: Path = Path("runs/model"),
     resume: bool = False,
     seed: int = 0,
+    state_model: str = "hmm",
 ) -> Checkpoint:
     """Train a model and write its folder; the stages' state lives beside it until the folder is written.
 
     Raises:
-        UserError: on an unknown dataset, stage or variant, a dataset without a second human, a run that cannot
-            be resumed, or a folder that holds something else.
+        UserError: on an unknown dataset, stage, variant or state model, a dataset without a second human, a run that
+            cannot be resumed, or a folder that holds something else.
     """
     choose("stage", stage, ("hhi", "hri"))
     variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
     if not variants:
         raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
-    options = TrainingOptions(seeds=seeds, seed=seed)
+    options = TrainingOptions(seeds=seeds, seed=seed, state_model=state_model)
     if epochs is not None:
         options = replace(options, human_epochs=epochs, robot_epochs=epochs)
     check_checkpoint_target(out)
@@ -110,6 +113,7 @@ def train(
     command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
     command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
     command += ["--seed", str(seed)] if seed else []
+    command += ["--state-model", state_model] if state_model != TrainingOptions.state_model else []
     command += ["--out", str(out)]
     training = {
         "command": shlex.join(command),
@@ -125,9 +129,13 @@ def train(
     metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
+        contact = contact_states(chosen, fit)
+        # the HMMs were fitted to the human VAE's latents of both people
+        fitted = InteractionModel(chosen.human_vae, chosen.hmms, chosen.human_vae)
         chosen = replace(
             chosen,
-            contact_states=contact_states(chosen, fit),
+            contact_states=contact,
+            transition_states=learn_transition_states(fitted, contact, human_data),
             placement=contact_placement(source.train),
         )
     saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
