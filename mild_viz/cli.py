@@ -23,7 +23,7 @@ from mild_viz.run_options import (
     documented,
     leave,
 )
-from mild_viz.train_commands import sweep, train
+from mild_viz.train_commands import sweep, train, train_baseline
 
 
 def app(
@@ -195,6 +195,7 @@ COMMANDS = {
     "app": app,
     "data": data,
     "train": train,
+    "train-baseline": train_baseline,
     "sweep": sweep,
     "evaluate": evaluate,
     "report": report,

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from mild_viz.errors import UserError
+
+Result = TypeVar("Result")
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -26,3 +31,34 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}; choose another place") from None
+
+
+def replace_folder(path: Path, fill: Callable[[Path], Result]) -> Result:
+    """Let `fill` fill a new folder beside `path`, then move it there whole, in place of what is there.
+
+    Returns what `fill` returns. Whatever it raises, `path` is as it was, and nothing stays beside it.
+
+    Raises:
+        UserError: if the place cannot be written, naming it and the reason.
+    """
+    try:
+        target = path.resolve()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name[:50]}.", dir=target.parent))
+        built, old = work / "new", work / "old"
+        try:
+            built.mkdir()
+            result = fill(built)
+            try:
+                if target.exists():
+                    os.replace(target, old)
+                os.replace(built, target)
+            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
+                if old.exists() and not target.exists():
+                    os.replace(old, target)
+                raise
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}; choose another place") from None
+    return result

@@ -155,7 +155,8 @@ def _state_model(value: Any, where: str) -> str:
     return choose(where, _typed(value, str, where), list(STATE_MODELS))
 
 
-def _robot(value: Any, where: str) -> RobotInterface | None:
+def parse_robot(value: Any, where: str) -> RobotInterface | None:
+    """The robot that a model drives, as config.json holds it."""
     if value is None:
         return None
     _need(_typed(value, dict, where), ("name", "joint_names", "end_effector"), where)
@@ -233,6 +234,11 @@ def read_config(file: Path) -> Config:
         UserError: naming the field, what was found and what was expected.
     """
     config = _typed(read_json(file), dict, str(file))
+    if (kind := config.get("kind")) is not None:
+        raise UserError(
+            f"{file}: this is a model of kind {reprlib.repr(kind)}, expected a MILD checkpoint as written by "
+            "`mild-viz train`; models of other kinds can be measured with `mild-viz evaluate`"
+        )
     if not is_config(config):
         found = reprlib.repr(config.get("schema_version"))
         raise UserError(f"{file}: schema_version is {found}, this program reads {SCHEMA_VERSION}")
@@ -250,7 +256,7 @@ def read_config(file: Path) -> Config:
     actions = _names(config["actions"], f"{file}: actions")
     for action in actions:
         choose(f"{file}: action", action, ACTIONS)
-    robot = _robot(config["robot"], f"{file}: robot")
+    robot = parse_robot(config["robot"], f"{file}: robot")
     contact = parse_contact_states(config.get("contact_states", {}), actions, n_states, f"{file}: contact_states")
     variants = _variants(config["variants"], robot, f"{file}: variants")
     own_models = _own_models(config.get("own_models", {}), variants, f"{file}: own_models")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -26,11 +25,13 @@ from mild_viz.checkpoint.config import (
 from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.checkpoint.tensors import read_parts, tensors_of
 from mild_viz.errors import UserError
-from mild_viz.files import write_atomically
+from mild_viz.files import replace_folder, write_atomically
 from mild_viz.settings import choose
 
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
 FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
+
+Model = TypeVar("Model")
 
 
 def check_checkpoint_target(out: Path) -> None:
@@ -63,7 +64,15 @@ def check_checkpoint_target(out: Path) -> None:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoint:
-    """Write a checkpoint's folder, and return it as loaded from there.
+    """Write a checkpoint's folder, and return it as loaded from there. See `save_folder` for its errors."""
+    loaded = save_folder(path, tensors_of(checkpoint), config_of(checkpoint), readme, load_checkpoint)
+    return replace(loaded, path=path)
+
+
+def save_folder(
+    path: Path, tensors: dict[str, np.ndarray], config: dict[str, Any], readme: str, load: Callable[[Path], Model]
+) -> Model:
+    """Write a model's folder, and return it as `load` reads it.
 
     It is built beside its place, loaded to see that it is valid, and then moved there whole. An older
     checkpoint there is replaced, contact_states.json that a person saved in it included: it names states
@@ -74,35 +83,31 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
             then as it was.
     """
     check_checkpoint_target(path)
-    try:
-        target = path.resolve()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name[:50]}.", dir=target.parent))
-        built, old = work / "new", work / "old"
+
+    def fill(built: Path) -> Model:
         try:
-            built.mkdir()
-            save_file(tensors_of(checkpoint), built / WEIGHTS)
-            (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
-            (built / CONFIG).write_text(json.dumps(config_of(checkpoint), indent=2) + "\n", encoding="utf-8")
-            (built / README).write_text(readme, encoding="utf-8", errors="replace")
-            try:
-                loaded = load_checkpoint(built)
-            except UserError as error:
-                raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
-            try:
-                if target.exists():
-                    os.replace(target, old)
-                os.replace(built, target)
-            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
-                if old.exists() and not target.exists():
-                    os.replace(old, target)
-                raise
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except (OSError, SafetensorError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path} cannot be written: {reason}; choose another place") from None
-    return replace(loaded, path=path)
+            save_file(tensors, built / WEIGHTS)
+        except SafetensorError as error:
+            raise UserError(f"{path} cannot be written: {error}; choose another place") from None
+        (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
+        (built / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        (built / README).write_text(readme, encoding="utf-8", errors="replace")
+        try:
+            return load(built)
+        except UserError as error:
+            raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
+
+    return replace_folder(path, fill)
+
+
+def load_tensors(file: Path) -> dict[str, np.ndarray]:
+    """The content of a safetensors file. Raises `UserError` where it is missing or damaged."""
+    if not file.is_file():
+        raise UserError(f"{file} is missing")
+    try:
+        return load_file(file)
+    except Exception as error:  # besides its own error it has KeyError for a number type that NumPy lacks
+        raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -122,13 +127,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             "as written by `mild-viz train` or `mild-viz import-published`"
         )
     config = read_config(config_file)
-    if not file.is_file():
-        raise UserError(f"{file} is missing")
-    try:
-        tensors = load_file(file)
-    except Exception as error:  # besides its own error it has KeyError for a number type that NumPy lacks
-        raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
-    parts = read_parts(tensors, config, str(file))
+    parts = read_parts(load_tensors(file), config, str(file))
     checkpoint = Checkpoint(
         path=path,
         name=config.name,

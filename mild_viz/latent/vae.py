@@ -87,8 +87,19 @@ def make_vae(
     tensors: Mapping[str, np.ndarray], input_size: int, hidden: tuple[int, int], latent_size: int, where: str
 ) -> VAE:
     """A VAE from named tensors, each checked; an error names the tensor, its shape and the expected one."""
-    weights = {}
-    for name, shape in layer_shapes(input_size, hidden, latent_size).items():
+    return VAE(checked_tensors(tensors, layer_shapes(input_size, hidden, latent_size), where))
+
+
+def checked_tensors(
+    tensors: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], where: str
+) -> dict[str, np.ndarray]:
+    """The tensors of the given names, read-only and in double precision.
+
+    Raises:
+        UserError: if one is missing, has another shape than the given one, or values that are not finite.
+    """
+    checked = {}
+    for name, shape in shapes.items():
         if name not in tensors:
             raise UserError(f"{where}: tensor '{name}' is missing")
         tensor = np.array(tensors[name], dtype=np.float64)
@@ -97,5 +108,5 @@ def make_vae(
         if not np.isfinite(tensor).all():
             raise UserError(f"{where}: tensor '{name}' has values that are not finite")
         tensor.flags.writeable = False
-        weights[name] = tensor
-    return VAE(weights)
+        checked[name] = tensor
+    return checked

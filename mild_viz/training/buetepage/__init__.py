@@ -1,0 +1,1 @@
+"""Training of the baseline of Bütepage et al. (2020), as the paper's authors configured it."""
