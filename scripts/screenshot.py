@@ -77,7 +77,10 @@ def main(options: Options) -> None:
 
     options.out.mkdir(parents=True, exist_ok=True)
     many = len(options.size) * len(options.theme) > 1
-    with running_app(options.dataset, options.action, options.trial, options.checkpoint) as url, sync_playwright() as playwright:
+    with (
+        running_app(options.dataset, options.action, options.trial, options.checkpoint) as url,
+        sync_playwright() as playwright,
+    ):
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=list(CHROMIUM))
         for size in options.size:
             width, height = map(int, size.split("x"))
