@@ -42,7 +42,7 @@ class NaiveMild:
     def __init__(self, checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel) -> None:
         hmm = checkpoint.hmm(action)
         self.human = {name: torch.tensor(value) for name, value in checkpoint.human_vae.weights.items()}
-        vae: VAE = checkpoint.robot_vae(variant)
+        vae: VAE = checkpoint.members(variant)[0].robot_vae
         self.robot = {name: torch.tensor(value) for name, value in vae.weights.items()}
         self.size = checkpoint.human_vae.latent_size
         self.initial, self.transition = torch.tensor(hmm.initial_probs), torch.tensor(hmm.transition_matrix)

@@ -62,7 +62,7 @@ def main(
     body = load_robot(robot, interface.joint_names, interface.end_effector)
     trial = lengthened(longest_trial(load_dataset(dataset), action), frames)
     chosen = None if contact_states is None else frozenset(contact_states)
-    settings = with_contact_states(ControlSettings(controller="mild-ik", contact_states=chosen), model, action)
+    settings = with_contact_states(ControlSettings(controller="mild-ik", contact_states=chosen), model, variant, action)
     if not settings.contact_states:
         raise UserError(f"checkpoint {model.name} has no contact states for '{action}'; give --contact-states")
     touching = settings.contact_states

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -19,10 +19,11 @@ from mild_viz.run_options import (
     OptionalText,
     OptionalVariant,
     RunOptions,
-    VariantName,
     check_output,
     documented,
+    leave,
 )
+from mild_viz.train_commands import sweep, train
 
 
 def app(
@@ -31,7 +32,7 @@ def app(
     action: OptionalText = None,
     trial: OptionalInt = None,
     variant: OptionalVariant = None,
-    robot: str = "pepper",
+    robot: OptionalText = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -44,7 +45,7 @@ def app(
     Args:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset, that is checkpoints/demo
             for demo, checkpoints/nuisi-pepper for nuisi. Example: --checkpoint checkpoints/nuisi-pepper
-        dataset: Recordings to open: demo (built in), nuisi, yumi, handover (see: mild-viz data list).
+        dataset: Recordings to open: demo (built in), nuisi, yumi, handover, buetepage (see: mild-viz data list).
             Example: --dataset nuisi
         action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the handshake, if
             dataset and model have it, else their first one. Example: --action rocket
@@ -52,8 +53,9 @@ def app(
             Example: --trial 5
         variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
             has the table). Default: v3.1, if the model has it. Example: --variant v2.1
-        robot: Robot to control: pepper, or the path of a URDF file with the joints that the model drives; meshes
-            named package://... are looked up beside the file. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file with the joints that the model
+            drives; meshes named package://... are looked up beside the file. Default: the robot that the model was
+            trained for. Example: --robot ~/pepper.urdf
         host: Network address to listen on. There is no password: leave it at this machine's own address unless
             everybody on the network may use the page. Example: --host 0.0.0.0
         port: TCP port to listen on. Example: --port 9000
@@ -82,7 +84,7 @@ def data_list() -> None:
     """
     from mild_viz.data.commands import list_datasets
 
-    _leave(list_datasets())
+    leave(list_datasets())
 
 
 def data_fetch(name: tyro.conf.Positional[str]) -> None:
@@ -96,7 +98,7 @@ def data_fetch(name: tyro.conf.Positional[str]) -> None:
     """
     from mild_viz.data.commands import fetch
 
-    _leave(fetch(name))
+    leave(fetch(name))
 
 
 def data_check(path: tyro.conf.Positional[Path]) -> None:
@@ -109,47 +111,7 @@ def data_check(path: tyro.conf.Positional[Path]) -> None:
     """
     from mild_viz.data.commands import check
 
-    _leave(check(path))
-
-
-def train(
-    out: OptionalPath = None,
-    dataset: str = "demo",
-    stage: Literal["hhi", "hri"] = "hri",
-    variant: tuple[VariantName, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
-    seeds: int = 4,
-    epochs: OptionalInt = None,
-    seed: int = 0,
-    resume: bool = False,
-    state_model: Literal["hmm", "hsmm"] = "hmm",
-) -> None:
-    """Train a model: Algorithms 1 and 2 of the paper.
-
-    Stage hhi trains the shared human VAE and one HMM for every interaction on human-human trials; stage hri does
-    that, and then trains the robot's VAEs on the frozen human side, all variants and seeds together. The best seed
-    is chosen on training trials that are held out, never on the test set.
-    Example: mild-viz train --dataset nuisi --out runs/nuisi --variant v3.1 v3.2 --seeds 8
-
-    Args:
-        out: Folder to write the model to; the state of an unfinished run lies beside it. Default: runs/DATASET-STAGE.
-            Example: --out runs/mine
-        dataset: Recordings of two humans to train on: demo, nuisi, handover. Example: --dataset nuisi
-        stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
-        variant: Variants to train, one or several. Example: --variant v3.1 v3.2
-        seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
-        epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
-        seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
-        resume: Go on from the state in --out, where an earlier run was interrupted.
-        state_model: Kind of state model: hmm, or hsmm with Gaussian durations of states. Example: --state-model hsmm
-    """
-    from mild_viz.training.run import train as run
-
-    made = run(
-        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, resume=resume, seed=seed,
-        out=out or Path("runs") / f"{dataset}-{stage}", state_model=state_model,
-    )  # fmt: skip
-    print(f"{made.path}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
-    print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {dataset}")
+    leave(check(path))
 
 
 def evaluate(
@@ -165,7 +127,7 @@ def evaluate(
 
     Args:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
         json: File for the table, as a list of rows. Default: print only. Example: --json results.json
     """
     if json is not None:
@@ -237,11 +199,6 @@ def import_published(file: tyro.conf.Positional[Path], out: Path) -> None:
     print(f"{out}: by its own arguments, {file.name} is {', '.join(checkpoint.variants)}")
 
 
-def _leave(status: int | None) -> None:
-    if status:
-        raise SystemExit(status)
-
-
 def _choice(commands: dict[str, Any]) -> Any:
     """A type of which tyro makes one subcommand for each entry; an entry may be a group of its own."""
     parts = [
@@ -261,6 +218,7 @@ COMMANDS = {
     "app": app,
     "data": data,
     "train": train,
+    "sweep": sweep,
     "evaluate": evaluate,
     "rollout": rollout,
     "record": record,

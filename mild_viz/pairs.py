@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, pair_windows
 from mild_viz.errors import UserError
+from mild_viz.robot.chain import ArmChain
+from mild_viz.robot.contact import upright
+from mild_viz.robot.model import load_robot
 from mild_viz.robot.retarget import retarget_pepper
-from mild_viz.robot.robots import PEPPER_JOINTS
+from mild_viz.robot.retarget_arm import retarget_arm
+from mild_viz.robot.robots import ROBOTS
 from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
 
@@ -43,21 +48,33 @@ class Windows:
 
 
 def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "T J"]:
-    """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to Pepper.
+    """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to a known robot.
 
-    NaN where the partner was not tracked for longer than a gap that is filled.
+    Pepper's arm takes over the angles of the person's, every other one the place of the hand. Where the partner's
+    heading in the world is known, the robot stands upright with that heading. NaN where the partner was not tracked
+    for longer than a gap that is filled.
 
     Raises:
         UserError: if the trial shows no motion for these joints.
     """
     if trial.robot_joints is not None and tuple(trial.robot_joint_names) == tuple(joint_names):
         return trial.robot_joints
-    if trial.partner_arm is not None and tuple(joint_names) == PEPPER_JOINTS:
-        return retarget_pepper(fill_gaps(trial.partner_arm, max_gap(trial.rate)))
-    raise UserError(
-        f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
-        f"it has {', '.join(trial.robot_joint_names) or 'no recorded robot'}"
-    )
+    robot = next((name for name, known in ROBOTS.items() if known.joint_names == tuple(joint_names)), None)
+    if trial.partner_arm is None or robot is None:
+        raise UserError(
+            f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
+            f"it has {', '.join(trial.robot_joint_names) or 'no recorded robot'}"
+        )
+    arm = fill_gaps(trial.partner_arm, max_gap(trial.rate))
+    if robot == "pepper":
+        return retarget_pepper(arm)
+    world = trial.T_world_partner
+    return retarget_arm(_chain(robot), arm, trial.rate, None if world is None else upright(world) @ world[:3, :3])
+
+
+@cache
+def _chain(robot: str) -> ArmChain:
+    return load_robot(robot).chain
 
 
 def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:

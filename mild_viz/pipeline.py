@@ -14,15 +14,17 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
 from mild_viz.errors import UserError
-from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
+from mild_viz.latent.interaction import InteractionModel
+from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import robot_truth
+from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import VARIANTS, WINDOW, ControlSettings
+from mild_viz.settings import WINDOW, ControlSettings
 from mild_viz.trial import Skeleton, Trial
 
 NEWEST = WINDOW - 1
@@ -35,31 +37,19 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
     Raises:
         UserError: if the checkpoint does not know the variant or the action, or the trial is too short.
     """
-    robot_vae = checkpoint.robot_vae(variant)
     interface = checkpoint.for_robot()
-    hmm = checkpoint.hmm(trial.action)
-    size = checkpoint.human_vae.latent_size
-    human, robot = slice(0, size), slice(size, 2 * size)
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
         raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")
-
     arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
-    mean, std = checkpoint.human_vae.encode(human_windows(arm)[:n_windows])
+    said = predict(checkpoint, variant, trial.action, human_windows(arm)[:n_windows])
+
+    model = checkpoint.members(variant)[0]
+    hmm, size = model.hmms[trial.action], model.human_vae.latent_size
+    human, robot = slice(0, size), slice(size, 2 * size)
     truth = robot_truth(trial, interface.joint_names)
     truth_windows = windows(truth)[WINDOW:]
-    latent_truth, _ = robot_vae.encode(truth_windows)
-
-    human_hmm = hmm.marginal(human)
-    human_likelihood = log_emission(human_hmm, mean)
-    log_alpha, _ = forward_filter(human_hmm, human_likelihood)
-    both = np.concatenate([mean, latent_truth], axis=1)
-    # Where the partner was lost, the human alone still says something.
-    joint_likelihood = np.where(observed_rows(both)[:, None], log_emission(hmm, both), human_likelihood)
-    log_alpha_joint, _ = forward_filter(hmm, joint_likelihood)
-    covariance_std = std if VARIANTS[variant].posterior_covariance else None
-    robot_mean, robot_covariance = condition(hmm, mean, log_alpha, covariance_std)
-    decoded = robot_vae.decode(robot_mean)
+    latent_truth, _ = model.robot_vae.encode(truth_windows)
 
     newest = slice(NEWEST, NEWEST + n_windows)
     n_joints = len(interface.joint_names)
@@ -72,20 +62,21 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         rate=trial.rate,
         joint_names=interface.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
-        observed=observed_rows(mean),
+        observed=observed_rows(said.human_mean),
         tracked=observed_rows(trial.human_arm[newest].reshape(n_windows, -1)),
-        log_alpha_human=log_alpha,
-        log_alpha_joint=log_alpha_joint,
+        log_alpha_human=said.log_alpha,
+        log_alpha_joint=joint_log_alpha(model, trial.action, said.human_mean, latent_truth),
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),
-        active_state=log_alpha.argmax(1),
-        human_latent_mean=mean,
-        human_latent_covariance=(std**2)[:, :, None] * np.eye(size),
-        robot_latent_mean=robot_mean,
-        robot_latent_covariance=robot_covariance,
+        active_state=said.log_alpha.argmax(1),
+        log_transition=said.log_transition,
+        human_latent_mean=said.human_mean,
+        human_latent_covariance=(said.human_std**2)[:, :, None] * np.eye(size),
+        robot_latent_mean=said.robot_mean,
+        robot_latent_covariance=said.robot_covariance,
         robot_latent_truth=latent_truth,
-        joints_decoded=decoded[:, :n_joints],
+        joints_decoded=said.decoded[:, :n_joints],
         joints_truth=truth[WINDOW : WINDOW + n_windows],
-        window_error=((decoded - truth_windows) ** 2).mean(1),
+        window_error=((said.decoded - truth_windows) ** 2).mean(1),
         human_state_means=hmm.emission_means[:, human],
         human_state_covariances=hmm.emission_covariances[:, human, human],
         robot_state_means=hmm.emission_means[:, robot],
@@ -97,11 +88,22 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
     )
 
 
+def joint_log_alpha(
+    model: InteractionModel, action: str, human_mean: Float[np.ndarray, "N D"], partner_mean: Float[np.ndarray, "N D"]
+) -> Float[np.ndarray, "N S"]:
+    """Forward variable given both agents' latents; where the partner was lost, the human alone still says something."""
+    hmm, human_hmm = model.hmms[action], model.human_hmms[action]
+    both = np.concatenate([human_mean, partner_mean], axis=1)
+    likelihood = np.where(observed_rows(both)[:, None], log_emission(hmm, both), log_emission(human_hmm, human_mean))
+    return forward_filter(hmm, likelihood)[0]
+
+
 def control(
     inference: Inference, checkpoint: Checkpoint, robot: RobotModel, trial: Trial, settings: ControlSettings
 ) -> Rollout:
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
-    settings = with_contact_states(settings, checkpoint, inference.action)
+    settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
+    transition = checkpoint.transition_state_of(inference.variant, inference.action)
     placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
     target = in_frame(placed.T_world_human, inference.human_hand)
     result = run_controller(
@@ -112,6 +114,7 @@ def control(
         inference.joints_decoded,
         target,
         initial_carry(robot.chain),
+        inference.log_transition if uses_transition(settings, transition) else None,
     )
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
@@ -137,14 +140,21 @@ def control(
     )
 
 
-def with_contact_states(settings: ControlSettings, checkpoint: Checkpoint, action: str) -> ControlSettings:
-    """The settings with contact states filled in: the chosen ones, else the checkpoint's for the action."""
+def with_contact_states(
+    settings: ControlSettings, checkpoint: Checkpoint, variant: str, action: str
+) -> ControlSettings:
+    """The settings with contact states filled in: the chosen ones, else the checkpoint's for variant and action."""
     if settings.contact_states is None:
-        return replace(settings, contact_states=checkpoint.contact_states.get(action, frozenset()))
+        return replace(settings, contact_states=checkpoint.contact_states_of(variant, action))
     bad = sorted(state for state in settings.contact_states if not 0 <= state < checkpoint.n_states)
     if bad:
         raise UserError(f"contact states {bad} do not exist; valid: 0 to {checkpoint.n_states - 1}")
     return settings
+
+
+def uses_transition(settings: ControlSettings, transition: TransitionState | None) -> bool:
+    """Whether a controller uses a transition state: only if it leads to the contact states that are chosen."""
+    return transition is not None and transition.contact_states == settings.contact_states
 
 
 def state_visits(

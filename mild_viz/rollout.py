@@ -13,7 +13,7 @@ from mild_viz.settings import Placement
 from mild_viz.trial import Skeleton, freeze_arrays
 
 SAVED = (
-    "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state",
+    "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state", "log_transition",
     "human_latent_mean", "human_latent_covariance", "robot_latent_mean", "robot_latent_covariance",
     "robot_latent_truth", "joints_decoded", "joints_commanded", "joints_truth", "end_effector", "target",
     "contact", "stiffness",
@@ -47,6 +47,8 @@ class Inference:
     log_alpha_unobserved: Float[np.ndarray, "N S"]
     active_state: Int[np.ndarray, " N"]
     """argmax of the human-only forward variable."""
+    log_transition: Float[np.ndarray, " N"]
+    """log probability of the transition state (`latent.transition`); -inf without one, and where not observed."""
     human_latent_mean: Float[np.ndarray, "N D"]
     human_latent_covariance: Float[np.ndarray, "N D D"]
     robot_latent_mean: Float[np.ndarray, "N D"]

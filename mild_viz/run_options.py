@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mild_viz.rollout import Rollout
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
-VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2"]
+VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
 
@@ -27,7 +27,7 @@ SplitName = Literal["train", "test"]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
-    VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2}", help_behavior_hint="")
+    VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
 ]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]
@@ -42,6 +42,12 @@ def documented(command: T) -> T:
     """Join the broken lines of each option's description: tyro would print the breaks of the source."""
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(command.__doc__ or ""))
     return command
+
+
+def leave(status: int | None) -> None:
+    """End the program with a status that is not 0."""
+    if status:
+        raise SystemExit(status)
 
 
 def check_output(path: Path, suffix: str) -> None:
@@ -63,7 +69,7 @@ class RunOptions:
 
     Attributes:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings: demo, nuisi, yumi, handover. Example: --dataset nuisi
+        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
         variant: Variant of MILD. Example: --variant v2.1
@@ -80,7 +86,8 @@ class RunOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, or the path of a URDF file. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. Default: the robot that the model
+            was trained for. Example: --robot ~/pepper.urdf
     """
 
     checkpoint: OptionalPath = None
@@ -95,7 +102,7 @@ class RunOptions:
     smoothing: float = 0.8
     stiffness: bool = True
     placement: OptionalPosition = None
-    robot: str = "pepper"
+    robot: OptionalText = None
 
     def run(self) -> tuple[Rollout, RobotModel]:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
@@ -117,5 +124,5 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = load_robot(self.robot, interface.joint_names, interface.end_effector)
+        robot = load_robot(self.robot or interface.name, interface.joint_names, interface.end_effector)
         return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings), robot

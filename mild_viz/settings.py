@@ -18,15 +18,21 @@ STATE_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of the paper's Table 'Differences in conditioning and sampling strategies'."""
+    """One row of the paper's Table 'Differences in conditioning and sampling strategies'; v4 is ours."""
 
     name: str
     conditional_training: str
     """What the robot decoder is trained on besides posterior samples: 'none', 'posterior-samples'
-    (conditioned means of samples of the human posterior) or 'conditional-samples' (samples of Eq. pz2z1)."""
+    (conditioned means of samples of the human posterior), 'conditional-samples' (samples of Eq. pz2z1) or 'joint'
+    (human, HMM and robot together, on the conditional given the filtered forward variable and a short history)."""
     posterior_covariance: bool
     """Whether the human posterior's covariance enters the gain (Eq. conditioning-withcov-K-i)."""
     summary: str
+
+    @property
+    def own_models(self) -> bool:
+        """Whether it has human VAEs and HMMs of its own, several of them; the others share one human side."""
+        return self.conditional_training == "joint"
 
 
 VARIANTS: dict[str, Variant] = {
@@ -37,8 +43,12 @@ VARIANTS: dict[str, Variant] = {
         Variant("v2.2", "posterior-samples", True, "as v2.1, with the posterior covariance"),
         Variant("v3.1", "conditional-samples", False, "decodes samples of the conditional"),
         Variant("v3.2", "conditional-samples", True, "as v3.1, with the posterior covariance"),
+        Variant("v4", "joint", False, "trained jointly, conditioned on a short history, averaged over several models"),
     )
 }
+
+PAPER_VARIANTS = tuple(name for name, variant in VARIANTS.items() if not variant.own_models)
+"""Those of the paper: one frozen human side, on which they train."""
 
 MAX_PLACEMENT = 100
 """A human stands nearer than this to the robot, in each direction [m]."""

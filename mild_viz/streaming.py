@@ -13,29 +13,28 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
-from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import HMM, FilterCarry, log_emission
-from mild_viz.latent.vae import VAE
-from mild_viz.pipeline import with_contact_states
+from mild_viz.latent.interaction import InteractionModel, ModelCarry
+from mild_viz.pipeline import uses_transition, with_contact_states
+from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import HUMAN_FEATURES, VARIANTS, WINDOW, ControlSettings
+from mild_viz.settings import HUMAN_FEATURES, WINDOW, ControlSettings, choose
 
 
 @dataclass(frozen=True, eq=False)
 class StreamModel:
     """What does not change between observations."""
 
-    human_vae: VAE
-    robot_vae: VAE
-    hmm: HMM
-    human_hmm: HMM
-    posterior_covariance: bool
+    models: tuple[InteractionModel, ...]
+    variant: str
     action: str
     robot: RobotModel
     settings: ControlSettings
+    uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
+    rate: float
+    """Observations a second [Hz]."""
     max_gap: int
     """Frames for which a lost observation is bridged."""
 
@@ -52,7 +51,7 @@ class Carry(NamedTuple):
     """Frames since it was seen."""
     previous: Float[np.ndarray, " 9"] | None
     """The previous frame's filled position."""
-    filter: FilterCarry | None
+    models: tuple[ModelCarry, ...]
     control: ControlCarry
 
 
@@ -60,6 +59,7 @@ class Command(NamedTuple):
     """The answer to one observation; `None` fields until the first window is full."""
 
     log_alpha: Float[np.ndarray, " S"]
+    log_transition: float
     active_state: int
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
@@ -80,17 +80,17 @@ def stream_model(
     rate: float,
 ) -> StreamModel:
     """Everything that a stream of observations at `rate` [Hz] needs."""
-    hmm = checkpoint.hmm(action)
+    choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
+    settings = with_contact_states(settings, checkpoint, variant, action)
     return StreamModel(
-        human_vae=checkpoint.human_vae,
-        robot_vae=checkpoint.robot_vae(variant),
-        hmm=hmm,
-        human_hmm=hmm.marginal(slice(0, checkpoint.human_vae.latent_size)),
-        posterior_covariance=VARIANTS[variant].posterior_covariance,
+        models=checkpoint.members(variant),
+        variant=variant,
         action=action,
         robot=robot,
-        settings=with_contact_states(settings, checkpoint, action),
+        settings=settings,
+        uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
+        rate=rate,
         max_gap=max_gap(rate),
     )
 
@@ -98,7 +98,8 @@ def stream_model(
 def start(model: StreamModel) -> Carry:
     """The state before the first observation."""
     empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
-    return Carry(empty, 0, None, 0, None, None, initial_carry(model.robot.chain))
+    starts = tuple(each.start() for each in model.models)
+    return Carry(empty, 0, None, 0, None, starts, initial_carry(model.robot.chain))
 
 
 def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tuple[Carry, Command | None]:
@@ -112,25 +113,27 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     window = seen.features.reshape(1, -1)
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
-    mean, std = model.human_vae.encode(window)
-    log_alpha, _, filtered = model.human_hmm.filter(log_emission(model.human_hmm, mean), seen.filter)
-    latent_mean, latent_covariance = condition(model.hmm, mean, log_alpha, std if model.posterior_covariance else None)
-    decoded = model.robot_vae.decode(latent_mean)[:, : len(model.robot.chain.joint_names)]
+    said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
+    decoded = said.decoded[:, : len(model.robot.chain.joint_names)]
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     target = in_frame(model.T_world_human, hand[None])
-    result = run_controller(model.robot.chain, model.settings, model.action, log_alpha, decoded, target, seen.control)
+    log_transition = said.log_transition if model.uses_transition else None
+    result = run_controller(
+        model.robot.chain, model.settings, model.action, said.log_alpha, decoded, target, seen.control, log_transition
+    )
     command = Command(
-        log_alpha=log_alpha[0],
-        active_state=int(log_alpha[0].argmax()),
-        robot_latent_mean=latent_mean[0],
-        robot_latent_covariance=latent_covariance[0],
+        log_alpha=said.log_alpha[0],
+        log_transition=float(said.log_transition[0]),
+        active_state=int(said.log_alpha[0].argmax()),
+        robot_latent_mean=said.robot_mean[0],
+        robot_latent_covariance=said.robot_covariance[0],
         joints_decoded=decoded[0],
         joints_commanded=result.joints[0],
         target=target[0],
         contact=bool(result.contact[0]),
         stiffness=result.stiffness[0],
     )
-    return seen._replace(filter=filtered, control=result.carry), command
+    return seen._replace(models=models, control=result.carry), command
 
 
 def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
@@ -144,4 +147,4 @@ def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) ->
     position = filled.reshape(9)
     velocity = np.zeros(9) if carry.previous is None else position - carry.previous
     features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.filter, carry.control)
+    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.models, carry.control)

@@ -56,6 +56,7 @@ def make_inference(n: int = 60, n_states: int = 3, trial: int = 0, **fields: Any
         "log_alpha_joint": log_alpha,
         "log_alpha_unobserved": log_alpha,
         "active_state": active,
+        "log_transition": np.full(n, -np.inf),
         "human_latent_mean": np.zeros((n, 2)),
         "human_latent_covariance": np.tile(np.eye(2), (n, 1, 1)),
         "robot_latent_mean": np.zeros((n, 2)),

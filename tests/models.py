@@ -11,10 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint, RobotInterface
+from mild_viz.latent.context import ContextLayout, fit_regression
 from mild_viz.latent.hmm import HMM, safe_log
 from mild_viz.latent.hsmm import HSMM
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE, layer_shapes
 from mild_viz.robot.robots import ROBOTS
+from mild_viz.settings import PAPER_VARIANTS
 
 PEPPER = RobotInterface("pepper", ROBOTS["pepper"].joint_names, ROBOTS["pepper"].end_effector)
 ACTIONS = ("wave", "handshake", "rocket", "parachute")
@@ -23,7 +26,7 @@ ACTIONS = ("wave", "handshake", "rocket", "parachute")
 def random_vae(rng: np.random.Generator, input_size: int, hidden: tuple[int, int] = (40, 20), latent: int = 5) -> VAE:
     return VAE(
         {
-            name: rng.normal(size=shape) / np.sqrt(shape[-1])
+            name: (rng.normal(size=shape) / np.sqrt(shape[-1])).astype(np.float32).astype(float)  # as it is stored
             for name, shape in layer_shapes(input_size, hidden, latent).items()
         }
     )
@@ -71,11 +74,29 @@ def random_hsmm(rng: np.random.Generator, n_states: int, size: int, longest: flo
     )
 
 
+LAYOUT = ContextLayout(lags=(3, 7), clock=True)
+
+
+def random_own_model(rng: np.random.Generator, robot_size: int = 20) -> InteractionModel:
+    """A model as those of v4: with a regression on a context."""
+    size = LAYOUT.size(5)
+    regressions = {
+        action: fit_regression(
+            rng.normal(size=(60, size)), rng.normal(size=(60, 5)), rng.dirichlet(np.ones(6), size=60), 0.1
+        )
+        for action in ACTIONS
+    }
+    hmms = {action: random_hmm(rng, 6, 10) for action in ACTIONS}
+    return InteractionModel(random_vae(rng, 90), hmms, random_vae(rng, robot_size), LAYOUT, regressions)
+
+
 def random_checkpoint(
     seed: int = 0,
-    variants: tuple[str, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
+    variants: tuple[str, ...] = PAPER_VARIANTS,
     model: Callable[[np.random.Generator, int, int], HMM] = random_hmm,
+    n_own: int = 0,
 ) -> Checkpoint:
+    """A model with the given variants, and with `n_own` models of v4."""
     rng = np.random.default_rng(seed)
     return Checkpoint(
         path=Path("nowhere"),
@@ -86,5 +107,7 @@ def random_checkpoint(
         hmms={action: model(rng, 6, 10) for action in ACTIONS},
         robot_vaes={variant: random_vae(rng, 20) for variant in variants},
         robot=PEPPER,
+        own_models={"v4": tuple(random_own_model(rng) for _ in range(n_own))} if n_own else {},
+        rate=30.0,
         contact_states={"handshake": frozenset({2, 3})},
     )

@@ -51,6 +51,7 @@ def scene_inference(
         "log_alpha_joint": log_alpha,
         "log_alpha_unobserved": np.full((n, n_states), -np.log(n_states)),
         "active_state": log_alpha.argmax(1),
+        "log_transition": np.full(n, -np.inf),
         "human_latent_mean": curve,
         "human_latent_covariance": np.tile(0.01 * np.eye(5), (n, 1, 1)),
         "robot_latent_mean": 0.8 * curve + 0.3,

@@ -36,7 +36,7 @@ def latents(model: Checkpoint, trial: Trial, variant: str) -> tuple[np.ndarray, 
     """Posterior means of the human's and of the true robot's windows, row by row."""
     robot = windows(robot_truth(trial, model.for_robot().joint_names))[5:]
     human = human_windows(trial.human_arm)[: len(robot)]
-    return model.human_vae.encode(human)[0], model.robot_vae(variant).encode(robot)[0]
+    return model.human_vae.encode(human)[0], model.members(variant)[0].robot_vae.encode(robot)[0]
 
 
 @pytest.fixture(scope="module", params=["demo", "random"])

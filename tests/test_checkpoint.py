@@ -45,7 +45,7 @@ def test_what_is_saved_is_loaded(folder: Path) -> None:
 
 
 def test_saving_again_replaces_the_whole_folder(folder: Path) -> None:
-    save_contact_states(load_checkpoint(folder), "wave", frozenset({1}))
+    save_contact_states(load_checkpoint(folder), "v3.1", "wave", frozenset({1}))
     save_checkpoint(random_checkpoint(1, ("v3.1",)), folder, "# new\n")
     assert sorted(p.name for p in folder.iterdir()) == ["README.md", "config.json", "weights.safetensors"]
     assert load_checkpoint(folder).variants == ("v3.1",)
@@ -261,7 +261,7 @@ def test_broken_files_are_named(folder: Path, tmp_path: Path) -> None:
 def test_unknown_variant_and_action_list_the_valid_ones() -> None:
     model = random_checkpoint(variants=("v1", "v3.1"))
     with pytest.raises(UserError, match=r"'v3\.2' is unknown; valid: v1, v3\.1"):
-        model.robot_vae("v3.2")
+        model.members("v3.2")
     with pytest.raises(UserError, match="'handover' is unknown; valid: wave"):
         model.hmm("handover")
 
@@ -272,9 +272,9 @@ def saved_model(folder: Path) -> Checkpoint:
 
 def test_saved_contact_states_are_the_default_next_time(folder: Path) -> None:
     before = (folder / "weights.safetensors").read_bytes(), (folder / "config.json").read_bytes()
-    updated = save_contact_states(saved_model(folder), "handshake", frozenset({4}))
+    updated = save_contact_states(saved_model(folder), "v3.1", "handshake", frozenset({4}))
     assert updated.contact_states["handshake"] == frozenset({4})
-    save_contact_states(updated, "rocket", frozenset())
+    save_contact_states(updated, "v3.1", "rocket", frozenset())
     again = saved_model(folder)
     assert again.contact_states == {"handshake": frozenset({4}), "rocket": frozenset()}
     assert before == ((folder / "weights.safetensors").read_bytes(), (folder / "config.json").read_bytes())
@@ -282,7 +282,7 @@ def test_saved_contact_states_are_the_default_next_time(folder: Path) -> None:
 
 def test_invalid_contact_states_are_refused(folder: Path) -> None:
     with pytest.raises(UserError, match=r"states \[6\] do not exist; valid: 0 to 5"):
-        save_contact_states(saved_model(folder), "handshake", frozenset({6}))
+        save_contact_states(saved_model(folder), "v3.1", "handshake", frozenset({6}))
     (folder / "contact_states.json").write_text('{"handshake": [17]}')
     with pytest.raises(UserError, match=r"contact_states\.json.*\[17\] do not exist"):
         saved_model(folder)
@@ -295,6 +295,69 @@ def test_a_folder_that_cannot_be_written_says_so(folder: Path, monkeypatch: pyte
     model = saved_model(folder)
     monkeypatch.setattr("mild_viz.files.os.replace", refuse)
     with pytest.raises(UserError, match=r"contact_states\.json cannot be written: Permission denied"):
-        save_contact_states(model, "handshake", frozenset({1}))
+        save_contact_states(model, "v3.1", "handshake", frozenset({1}))
     assert not (folder / "contact_states.json").exists()
     assert not list(folder.glob(".*"))
+
+
+# --- variants with models of their own
+
+
+def own_folder(tmp_path: Path) -> Path:
+    path = tmp_path / "own"
+    save_checkpoint(
+        replace(random_checkpoint(n_own=2), own_contact_states={"v4": {"wave": frozenset({5})}}), path, "#\n"
+    )
+    return path
+
+
+def test_own_models_are_loaded_as_saved(tmp_path: Path) -> None:
+    original, loaded = random_checkpoint(n_own=2), load_checkpoint(own_folder(tmp_path))
+    assert loaded.variants == (*original.robot_vaes, "v4") and loaded.rate == 30.0
+    for before, after in zip(original.members("v4"), loaded.members("v4"), strict=True):
+        assert after.layout == before.layout
+        for action in original.actions:
+            np.testing.assert_array_equal(after.regressions[action].gain, before.regressions[action].gain)
+            np.testing.assert_array_equal(after.hmms[action].emission_means, before.hmms[action].emission_means)
+        z = np.random.default_rng(0).normal(size=(3, 5))
+        np.testing.assert_array_equal(after.robot_vae.decode(z), before.robot_vae.decode(z))
+    assert loaded.members("v4")[0].hmms["wave"] is not loaded.hmms["wave"]
+
+
+def test_contact_states_of_own_models_are_kept_apart(tmp_path: Path) -> None:
+    folder = own_folder(tmp_path)
+    loaded = load_checkpoint(folder)
+    assert loaded.contact_states_of("v4", "wave") == {5} and loaded.contact_states_of("v3.1", "handshake") == {2, 3}
+    assert loaded.contact_states_of("v4", "handshake") == frozenset()
+    save_contact_states(loaded, "v4", "handshake", frozenset({1}))
+    again = save_contact_states(load_checkpoint(folder), "v1", "handshake", frozenset({4}))
+    for checkpoint in (again, load_checkpoint(folder)):
+        assert checkpoint.contact_states_of("v4", "handshake") == {1}
+        assert checkpoint.contact_states_of("v4", "wave") == {5}
+        assert checkpoint.contact_states_of("v3.2", "handshake") == {4}
+
+
+def edited(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    config = json.loads((folder / "config.json").read_text())
+    change(config)
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["own_models"].pop("v4"), r"own_models is about nothing, expected v4"),
+        (lambda c: c["own_models"]["v4"].update(n_models=3), r"v4/2/human: tensor 'encoder.0.weight' is missing"),
+        (lambda c: c["own_models"]["v4"].update(lags=[3]), r"regression/wave/gain' has shape \(6, 5, 17\), expected"),
+        (lambda c: c["own_models"]["v4"].update(lags=[0]), r"v4.lags is 0, expected a whole number"),
+        (lambda c: c["own_models"]["v4"].update(clock=1), r"v4.clock is 1, expected true or false"),
+        (lambda c: c.update(rate=0), r"rate is 0.0, expected frames a second"),
+        (lambda c: c.update(own_contact_states={"v3.1": {}}), r"own_contact_states 'v3.1' is unknown; valid: v4"),
+    ],
+)
+def test_what_is_wrong_with_own_models_is_named(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        load_checkpoint(edited(own_folder(tmp_path), change))

@@ -79,7 +79,7 @@ def test_check_refuses_what_it_cannot_use(tmp_path: Path) -> None:
     trial = np.empty(1, dtype=object)
     trial[0] = np.zeros((20, 7))
     np.savez(tmp_path / "wide.npz", train_data=trial, train_labels=[0], test_data=trial, test_labels=[0])
-    with pytest.raises(UserError, match=r"7 columns; valid: 18 \(NuiSI\), 16 \(HRI-Yumi\)"):
+    with pytest.raises(UserError, match=r"7 columns; valid: 18 \(NuiSI, Bütepage\), 16 \(HRI-Yumi\)"):
         commands.check(tmp_path / "wide.npz")
 
 

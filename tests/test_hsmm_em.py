@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mild_viz.latent.em import fit
+from mild_viz.latent.em import TRANSITION_FLOOR, Observations, fit
 from mild_viz.latent.hmm import log_emission
 from mild_viz.latent.hsmm import HSMM, check_hsmm
 from mild_viz.latent.hsmm.em import em_step, equal_segments
@@ -70,7 +70,7 @@ def test_known_durations_explain_more_than_an_hmms(data: list[np.ndarray]) -> No
     totals = {}
     for name, entry in STATE_MODELS.items():
         model = fit_from_equal_segments(name, data, 4, 1e-3, 30)
-        totals[name] = entry.em_step(model, fresh, 1e-3)[1]
+        totals[name] = entry.em_step(model, Observations.of(fresh), 1e-3, TRANSITION_FLOOR)[1]
     assert totals["hsmm"] > totals["hmm"] + 2 * len(fresh)
 
 
@@ -95,7 +95,9 @@ def test_a_state_that_does_not_occur_gets_the_equal_splits_duration(data: list[n
 
 
 def test_a_state_whose_end_is_never_seen_lasts_no_longer_than_a_sequence(data: list[np.ndarray]) -> None:
-    model, _ = fit(equal_segments([s[:40] for s in data], 2, 1e-2), [s[:15] for s in data], 1e-2, 60, -1.0, em_step)
+    model, _ = fit(
+        equal_segments([s[:40] for s in data], 2, 1e-2), [s[:15] for s in data], 1e-2, 60, -1.0, step=em_step
+    )
     assert isinstance(model, HSMM)
     assert (model.duration_means <= 15.0).all() and (model.duration_stds <= 15.0).all()
 

@@ -16,10 +16,11 @@ from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import unobserved_forward
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import VARIANTS
+from mild_viz.settings import PAPER_VARIANTS, VARIANTS
 from mild_viz.training import run as training_run
 from mild_viz.training.human_stage import HumanModel, complete_rows, prior_states, train_human_stage
 from mild_viz.training.networks import BatchedVAE, gaussian_kl, standard_kl
@@ -27,6 +28,7 @@ from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import conditional_factors, train_robot_stage
 from mild_viz.training.run import choose_seed, hold_out, train
 from mild_viz.training.state import RunState
+from mild_viz.training.transition import learn_transition_states
 from tests.models import ACTIONS, random_checkpoint
 
 JOINTS = ROBOTS["pepper"].joint_names
@@ -194,7 +196,7 @@ def test_the_seed_is_chosen_by_held_out_error() -> None:
     held = hold_out(load_dataset("demo").train, 1)[1]
     candidates = [random_checkpoint(seed) for seed in range(3)]
     best, scores = choose_seed(candidates, held)
-    means = [np.mean([score[v] for v in VARIANTS if v != "v1"]) for score in scores]
+    means = [np.mean([score[v] for v in PAPER_VARIANTS if v != "v1"]) for score in scores]
     assert best == int(np.argmin(means)) and len(scores) == 3
 
 
@@ -209,6 +211,14 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
     assert made.variants == ("v3.1", "v1") and made.placement is not None and made.placement.estimated
     assert set(made.contact_states) == set(ACTIONS)
     assert made.contact_states["wave"] == frozenset() and made.contact_states["handshake"]
+    fit = stack_windows(hold_out(few, TrainingOptions().held_out)[0], None)
+    fitted = InteractionModel(made.human_vae, made.hmms, made.human_vae)
+    states = learn_transition_states(fitted, made.contact_states, fit)
+    assert states and made.transition_states.keys() == states.keys()
+    for action, state in states.items():
+        np.testing.assert_allclose(
+            made.transition_states[action].mean, state.mean, atol=1e-4
+        )  # saved weights are rounded
     config = json.loads((out / "config.json").read_text())
     assert config["training"]["command"].startswith("mild-viz train --dataset demo --stage hri --variant v3.1 v1")
     assert config["dataset"] == {"name": "demo", "checksum": whole.checksum}
@@ -221,7 +231,7 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
     assert (again.path / "weights.safetensors").read_bytes() == (out / "weights.safetensors").read_bytes()
 
     human = train("demo", "hhi", seeds=1, epochs=1, out=tmp_path / "human")
-    assert human.robot is None and load_checkpoint(human.path).variants == ()
+    assert human.robot is None and load_checkpoint(human.path).variants == ("v1",)
 
 
 def test_wrong_options_are_named(tmp_path: Path) -> None:
@@ -251,7 +261,7 @@ def test_a_damaged_state_is_named(tmp_path: Path) -> None:
 def test_a_diverged_seed_is_never_chosen() -> None:
     held = hold_out(load_dataset("demo").train, 1)[1]
     good = random_checkpoint(0)
-    weights = {name: np.full_like(value, np.nan) for name, value in good.robot_vae("v3.1").weights.items()}
+    weights = {name: np.full_like(value, np.nan) for name, value in good.members("v3.1")[0].robot_vae.weights.items()}
     broken = replace(good, robot_vaes={**good.robot_vaes, "v3.1": VAE(weights)})
     assert choose_seed([broken, good], held)[0] == 1
     with pytest.raises(UserError, match="every seed diverged"):

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from mild_viz.checkpoint.model import Checkpoint, RobotInterface
 from mild_viz.errors import UserError
+from mild_viz.latent.context import ContextLayout
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
 from mild_viz.trial import ACTIONS
@@ -21,6 +22,14 @@ MAX_SIZE = 100_000
 
 Kind = TypeVar("Kind")
 KINDS: dict[type, str] = {str: "a text", bool: "true or false", list: "a list [...]", dict: "an object {...}"}
+
+
+@dataclass(frozen=True)
+class OwnModels:
+    """What config.json says of a variant with models of its own."""
+
+    n_models: int
+    layout: ContextLayout
 
 
 @dataclass(frozen=True)
@@ -36,8 +45,12 @@ class Config:
     state_model: str
     actions: tuple[str, ...]
     robot: RobotInterface | None
-    variants: tuple[str, ...]
+    rate: float | None
+    robot_variants: tuple[str, ...]
+    """Those that have a robot VAE on the shared human side."""
+    own_models: dict[str, OwnModels]
     contact_states: dict[str, frozenset[int]]
+    own_contact_states: dict[str, dict[str, frozenset[int]]]
     placement: Placement | None
     training: dict[str, Any]
     metrics: dict[str, Any]
@@ -56,12 +69,25 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "state_model": checkpoint.state_model,
         "actions": list(checkpoint.actions),
         "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
-        "variants": {name: asdict(VARIANTS[name]) for name in checkpoint.variants},
-        "contact_states": {action: sorted(states) for action, states in checkpoint.contact_states.items()},
+        "rate": checkpoint.rate,
+        "variants": {name: asdict(VARIANTS[name]) for name in (*checkpoint.robot_vaes, *checkpoint.own_models)},
+        "own_models": {
+            name: {"n_models": len(models), **asdict(models[0].layout)}
+            for name, models in checkpoint.own_models.items()
+        },
+        "contact_states": states_as_json(checkpoint.contact_states),
+        "own_contact_states": {
+            variant: states_as_json(table) for variant, table in checkpoint.own_contact_states.items()
+        },
         "placement": asdict(checkpoint.placement) if checkpoint.placement else None,
         "training": dict(checkpoint.training),
         "metrics": dict(checkpoint.metrics),
     }
+
+
+def states_as_json(table: Mapping[str, frozenset[int]]) -> dict[str, list[int]]:
+    """Contact states by action as JSON holds them."""
+    return {action: sorted(states) for action, states in table.items()}
 
 
 def read_json(file: Path) -> Any:
@@ -149,6 +175,35 @@ def _variants(value: Any, robot: RobotInterface | None, where: str) -> tuple[str
     return tuple(value)
 
 
+def _own_models(value: Any, variants: Sequence[str], where: str) -> dict[str, OwnModels]:
+    """The table of the variants with models of their own, which are those of `variants` that the table says so of."""
+    table = _typed(value, dict, where)
+    expected = [name for name in variants if VARIANTS[name].own_models]
+    if sorted(table) != sorted(expected):
+        raise UserError(
+            f"{where} is about {', '.join(table) or 'nothing'}, expected {', '.join(expected) or 'nothing'}"
+        )
+    result = {}
+    for name, row in table.items():
+        _need(_typed(row, dict, f"{where}.{name}"), ("n_models", "lags", "clock"), f"{where}.{name}")
+        lags = tuple(_size(lag, f"{where}.{name}.lags") for lag in _typed(row["lags"], list, f"{where}.{name}.lags"))
+        try:
+            layout = ContextLayout(lags, _typed(row["clock"], bool, f"{where}.{name}.clock"))
+        except UserError as error:
+            raise UserError(f"{where}.{name}: {error}") from None
+        result[name] = OwnModels(_size(row["n_models"], f"{where}.{name}.n_models"), layout)
+    return result
+
+
+def _rate(value: Any, where: str) -> float | None:
+    if value is None:
+        return None
+    rate = _number(value, where)
+    if not 0.0 < rate <= MAX_SIZE:
+        raise UserError(f"{where} is {rate}, expected frames a second, above 0")
+    return rate
+
+
 def _placement(value: Any, where: str) -> Placement | None:
     if value is None:
         return None
@@ -197,6 +252,12 @@ def read_config(file: Path) -> Config:
         choose(f"{file}: action", action, ACTIONS)
     robot = _robot(config["robot"], f"{file}: robot")
     contact = parse_contact_states(config.get("contact_states", {}), actions, n_states, f"{file}: contact_states")
+    variants = _variants(config["variants"], robot, f"{file}: variants")
+    own_models = _own_models(config.get("own_models", {}), variants, f"{file}: own_models")
+    own_contact = {}
+    for variant, table in _typed(config.get("own_contact_states", {}), dict, f"{file}: own_contact_states").items():
+        choose(f"{file}: own_contact_states", variant, list(own_models))
+        own_contact[variant] = parse_contact_states(table, actions, n_states, f"{file}: own_contact_states.{variant}")
     return Config(
         name=_typed(config["name"], str, f"{file}: name"),
         dataset=_typed(dataset["name"], str, f"{file}: dataset.name"),
@@ -207,8 +268,11 @@ def read_config(file: Path) -> Config:
         state_model=_state_model(config.get("state_model", "hmm"), f"{file}: state_model"),
         actions=actions,
         robot=robot,
-        variants=_variants(config["variants"], robot, f"{file}: variants"),
+        rate=_rate(config.get("rate"), f"{file}: rate"),
+        robot_variants=tuple(name for name in variants if name not in own_models),
+        own_models=own_models,
         contact_states=contact,
+        own_contact_states=own_contact,
         placement=_placement(config.get("placement"), f"{file}: placement"),
         training=_typed(config.get("training", {}), dict, f"{file}: training"),
         metrics=_typed(config.get("metrics", {}), dict, f"{file}: metrics"),

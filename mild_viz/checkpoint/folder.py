@@ -6,43 +6,31 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from mild_viz.checkpoint.config import (
     SCHEMA_VERSION,
-    Config,
     check_states,
     config_of,
     is_config,
     parse_contact_states,
     read_config,
     read_json,
+    states_as_json,
 )
 from mild_viz.checkpoint.model import Checkpoint
+from mild_viz.checkpoint.tensors import read_parts, tensors_of
 from mild_viz.errors import UserError
 from mild_viz.files import write_atomically
-from mild_viz.latent.hmm import HMM
-from mild_viz.latent.state_models import STATE_MODELS
-from mild_viz.latent.vae import make_vae
-from mild_viz.settings import HUMAN_FEATURES, WINDOW
+from mild_viz.settings import choose
 
 WEIGHTS, CONFIG, README, CONTACT_STATES = "weights.safetensors", "config.json", "README.md", "contact_states.json"
 FILES = (WEIGHTS, CONFIG, README, CONTACT_STATES)
-
-
-def _tensors(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    tensors = {f"human/{name}": value for name, value in checkpoint.human_vae.weights.items()}
-    for action, hmm in checkpoint.hmms.items():
-        tensors |= {f"hmm/{action}/{field.name}": getattr(hmm, field.name) for field in fields(hmm)}
-    for variant, vae in checkpoint.robot_vaes.items():
-        tensors |= {f"robot/{variant}/{name}": value for name, value in vae.weights.items()}
-    return {name: np.ascontiguousarray(value) for name, value in tensors.items()}
 
 
 def check_checkpoint_target(out: Path) -> None:
@@ -93,7 +81,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
         built, old = work / "new", work / "old"
         try:
             built.mkdir()
-            save_file(_tensors(checkpoint), built / WEIGHTS)
+            save_file(tensors_of(checkpoint), built / WEIGHTS)
             (built / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
             (built / CONFIG).write_text(json.dumps(config_of(checkpoint), indent=2) + "\n", encoding="utf-8")
             (built / README).write_text(readme, encoding="utf-8", errors="replace")
@@ -101,12 +89,12 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
                 loaded = load_checkpoint(built)
             except UserError as error:
                 raise UserError(f"{path} is left as it was, the new model is not valid: {error}") from None
-            if target.exists():
-                os.replace(target, old)
             try:
+                if target.exists():
+                    os.replace(target, old)
                 os.replace(built, target)
-            except OSError:
-                if old.exists():
+            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
+                if old.exists() and not target.exists():
                     os.replace(old, target)
                 raise
         finally:
@@ -115,29 +103,6 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, readme: str) -> Checkpoi
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path} cannot be written: {reason}; choose another place") from None
     return replace(loaded, path=path)
-
-
-def _read_hmm(tensors: Mapping[str, np.ndarray], action: str, config: Config, where: str) -> HMM:
-    n_states, size = config.n_states, 2 * config.latent_size
-    state_model = STATE_MODELS[config.state_model]
-    shapes = {
-        "initial_probs": (n_states,), "transition_matrix": (n_states, n_states),
-        "emission_means": (n_states, size), "emission_covariances": (n_states, size, size),
-        "duration_means": (n_states,), "duration_stds": (n_states,),
-    }  # fmt: skip
-    values = {}
-    for name in (field.name for field in fields(state_model.kind)):
-        key, shape = f"hmm/{action}/{name}", shapes[name]
-        if key not in tensors:
-            raise UserError(f"{where}: tensor '{key}' is missing")
-        if tensors[key].shape != shape:
-            raise UserError(f"{where}: tensor '{key}' has shape {tensors[key].shape}, expected {shape}")
-        values[name] = tensors[key].astype(np.float64)
-    return state_model.check(state_model.kind(**values), f"{where}: hmm/{action}")
-
-
-def _part(tensors: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -163,45 +128,68 @@ def load_checkpoint(path: Path) -> Checkpoint:
         tensors = load_file(file)
     except Exception as error:  # besides its own error it has KeyError for a number type that NumPy lacks
         raise UserError(f"{file} is not a readable safetensors file: {type(error).__name__}: {error}") from None
-    hidden, latent, robot = config.hidden, config.latent_size, config.robot
-    robot_input = WINDOW * (len(robot.joint_names) if robot else HUMAN_FEATURES)
+    parts = read_parts(tensors, config, str(file))
     checkpoint = Checkpoint(
         path=path,
         name=config.name,
         dataset=config.dataset,
         dataset_checksum=config.dataset_checksum,
-        human_vae=make_vae(_part(tensors, "human/"), WINDOW * HUMAN_FEATURES, hidden, latent, f"{file}: human"),
-        hmms={action: _read_hmm(tensors, action, config, str(file)) for action in config.actions},
-        robot_vaes={
-            name: make_vae(_part(tensors, f"robot/{name}/"), robot_input, hidden, latent, f"{file}: robot/{name}")
-            for name in config.variants
-        },
-        robot=robot,
+        human_vae=parts.human_vae,
+        hmms=parts.hmms,
+        robot_vaes=parts.robot_vaes,
+        robot=config.robot,
+        own_models=parts.own_models,
+        rate=config.rate,
         contact_states=config.contact_states,
+        own_contact_states=config.own_contact_states,
+        transition_states=parts.transition_states,
         placement=config.placement,
-        hidden=hidden,
+        hidden=config.hidden,
         training=config.training,
         metrics=config.metrics,
     )
-    return replace(checkpoint, contact_states={**config.contact_states, **_read_contact_states(checkpoint)})
+    return _with_saved_states(checkpoint)
 
 
-def _read_contact_states(checkpoint: Checkpoint) -> dict[str, frozenset[int]]:
-    """The states that a person saved, if any."""
+def _read_contact_states(checkpoint: Checkpoint) -> tuple[dict[str, frozenset[int]], dict[str, Any]]:
+    """The states that a person saved, of the shared HMMs by action, and of a variant's own by variant and action."""
     file = checkpoint.path / CONTACT_STATES
     if not file.is_file():
-        return {}
-    return parse_contact_states(read_json(file), checkpoint.actions, checkpoint.n_states, str(file))
+        return {}, {}
+    content = read_json(file)
+    own = {}
+    if isinstance(content, dict):
+        own = {name: content.pop(name) for name in list(content) if name in checkpoint.own_models}
+    actions, states = checkpoint.actions, checkpoint.n_states
+    shared = parse_contact_states(content, actions, states, str(file))
+    return shared, {v: parse_contact_states(t, actions, states, f"{file}: {v}") for v, t in own.items()}
 
 
-def save_contact_states(checkpoint: Checkpoint, action: str, states: frozenset[int]) -> Checkpoint:
+def _with_saved_states(checkpoint: Checkpoint) -> Checkpoint:
+    """The checkpoint with what a person saved in the place of its own defaults."""
+    shared, own = _read_contact_states(checkpoint)
+    before = checkpoint.own_contact_states
+    return replace(
+        checkpoint,
+        contact_states={**checkpoint.contact_states, **shared},
+        own_contact_states={**before, **{v: {**before.get(v, {}), **table} for v, table in own.items()}},
+    )
+
+
+def save_contact_states(checkpoint: Checkpoint, variant: str, action: str, states: frozenset[int]) -> Checkpoint:
     """Make `states` the default contact states of an action, in the checkpoint's own small JSON file.
 
-    Weights and config.json are never touched. Returns the checkpoint with the new default.
+    They hold for all variants that share the HMMs, or for the one that has its own. Weights and config.json are never
+    touched. Returns the checkpoint with the new default.
     """
     check_states(states, action, checkpoint.actions, checkpoint.n_states, f"checkpoint {checkpoint.name}")
-    saved = {**_read_contact_states(checkpoint), action: states}
-    file = checkpoint.path / CONTACT_STATES
-    text = json.dumps({key: sorted(value) for key, value in saved.items()}, indent=2) + "\n"
-    write_atomically(file, lambda temporary: temporary.write_text(text))
-    return replace(checkpoint, contact_states={**checkpoint.contact_states, action: states})
+    choose(f"checkpoint {checkpoint.name}: variant", variant, checkpoint.variants)
+    shared, own = _read_contact_states(checkpoint)
+    if variant in checkpoint.own_models:
+        own = {**own, variant: {**own.get(variant, {}), action: states}}
+    else:
+        shared = {**shared, action: states}
+    content = states_as_json(shared) | {name: states_as_json(table) for name, table in own.items()}
+    text = json.dumps(content, indent=2) + "\n"
+    write_atomically(checkpoint.path / CONTACT_STATES, lambda temporary: temporary.write_text(text))
+    return _with_saved_states(checkpoint)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.state_models import state_model_of
+from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
-from mild_viz.settings import Placement, choose
+from mild_viz.settings import VARIANTS, Placement, choose
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,10 @@ class RobotInterface:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A trained model: one human VAE and, per action, one HMM; one robot VAE per variant."""
+    """A trained model: one human VAE and, per action, one HMM; one robot VAE per variant.
+
+    Variant v4 has models of its own beside them (`own_models`), whose predictions are averaged.
+    """
 
     path: Path
     name: str
@@ -35,9 +41,17 @@ class Checkpoint:
     hmms: Mapping[str, HMM]
     robot_vaes: Mapping[str, VAE]
     robot: RobotInterface | None
-    """None for a human-human model: the partner is then the second human."""
+    """None for a human-human model: the partner is then the second human, and the human VAE serves both."""
+    own_models: Mapping[str, tuple[InteractionModel, ...]] = field(default_factory=dict)
+    """By variant; all of the same actions and sizes."""
+    rate: float | None = None
+    """Frames a second of the recordings that it was trained on [Hz]; None where that is not known."""
     contact_states: Mapping[str, frozenset[int]] = field(default_factory=dict)
-    """States in which the partners touch, by action."""
+    """States in which the partners touch, by action, of the shared HMMs."""
+    own_contact_states: Mapping[str, Mapping[str, frozenset[int]]] = field(default_factory=dict)
+    """The same by variant and action, where a variant has HMMs of its own."""
+    transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
+    """Where reaching turns into contact, by action, in the latents that the variants share."""
     placement: Placement | None = None
     hidden: tuple[int, int] = (40, 20)
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -46,7 +60,9 @@ class Checkpoint:
 
     @property
     def variants(self) -> tuple[str, ...]:
-        return tuple(self.robot_vaes)
+        """The variants that it holds; a human-human model is v1 by construction (shared weights, no robot stage)."""
+        shared = tuple(self.robot_vaes) if self.robot is not None else ("v1",)
+        return shared + tuple(self.own_models)
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -65,9 +81,30 @@ class Checkpoint:
         choose(f"checkpoint {self.name}: action", action, self.actions)
         return self.hmms[action]
 
-    def robot_vae(self, variant: str) -> VAE:
+    def members(self, variant: str) -> tuple[InteractionModel, ...]:
+        """The models of a variant, whose predictions are averaged; the first one is what a page draws."""
         choose(f"checkpoint {self.name}: variant", variant, self.variants)
-        return self.robot_vaes[variant]
+        if variant in self.own_models:
+            return self.own_models[variant]
+        return (self._shared[variant],)
+
+    @cached_property
+    def _shared(self) -> dict[str, InteractionModel]:
+        vaes = self.robot_vaes if self.robot is not None else {"v1": self.human_vae}
+        transitions = self.transition_states
+        return {
+            name: InteractionModel(self.human_vae, self.hmms, vae, transition_states=transitions)
+            for name, vae in vaes.items()
+        }
+
+    def contact_states_of(self, variant: str, action: str) -> frozenset[int]:
+        """States in which the partners touch, by the model's default; empty where none are known."""
+        own = VARIANTS[variant].own_models
+        return (self.own_contact_states.get(variant, {}) if own else self.contact_states).get(action, frozenset())
+
+    def transition_state_of(self, variant: str, action: str) -> TransitionState | None:
+        """The transition state that a controller may use; None where there is none."""
+        return self.members(variant)[0].transition_states.get(action)
 
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""

@@ -139,11 +139,13 @@ def open_dashboard(
     action: str | None = None,
     trial: int | None = None,
     variant: str | None = None,
-    robot: str = "pepper",
+    robot: str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Dashboard:
-    """Load model, data and robot, and start the page. Returns while the first rollout is computed.
+    """Load model, data and robot (default: the model's own), and start the page.
+
+    Returns while the first rollout is computed.
 
     Raises:
         UserError: for anything that was given and cannot be used.
@@ -153,7 +155,7 @@ def open_dashboard(
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
     interface = model.for_robot()
-    arm = load_robot(robot, interface.joint_names, interface.end_effector)
+    arm = load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
     catalog = Catalog(arm, folder)
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
@@ -169,7 +171,7 @@ def run(
     action: str | None = None,
     trial: int | None = None,
     variant: str | None = None,
-    robot: str = "pepper",
+    robot: str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,

@@ -65,7 +65,7 @@ class Controls:
     def read(self) -> Choice:
         """What the widgets say, checked. Raises UserError naming the widget."""
         infer, checkpoint, trial = self._trial.read()
-        contact_states = self._states.read(checkpoint, trial.action)
+        contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, contact_states)
         return Choice(Settings(infer, control), self._view.read(), checkpoint, trial)
 
@@ -107,8 +107,8 @@ class Controls:
         return "" if choice is None else self._catalog.name_of(choice.checkpoint.path)
 
     def _compare_contact_states(self, ticked: frozenset[int], choice: Choice) -> None:
-        action = choice.trial.action
-        stored = self._catalog.current(choice.checkpoint).contact_states.get(action, frozenset())
+        action, variant = choice.trial.action, choice.settings.infer.variant
+        stored = self._catalog.current(choice.checkpoint).contact_states_of(variant, action)
         self._states.compare(ticked, stored, action, self._model_of(choice))
 
     def _save_contact_states(self) -> None:
@@ -116,10 +116,10 @@ class Controls:
         if choice is None:
             return
         states = choice.settings.control.contact_states or frozenset()
-        action = choice.trial.action
+        action, variant = choice.trial.action, choice.settings.infer.variant
         try:
             current = self._catalog.current(choice.checkpoint)
-            self._catalog.replace_checkpoint(save_contact_states(current, action, states))
+            self._catalog.replace_checkpoint(save_contact_states(current, variant, action, states))
         except UserError as error:
             self._states.say_saved(f"Not saved: {error}")
             return

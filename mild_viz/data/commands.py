@@ -98,7 +98,7 @@ def check(path: Path) -> int:
 
 def _read_npz(path: Path) -> tuple[str, Iterable[Trial]]:
     """The trials of a recording whose arrays show which dataset it is of."""
-    from mild_viz.data import handover, nuisi, yumi
+    from mild_viz.data import buetepage, handover, nuisi, yumi
 
     arrays = load_npz(path)
     if set(handover.ARRAYS) <= set(arrays):
@@ -106,14 +106,19 @@ def _read_npz(path: Path) -> tuple[str, Iterable[Trial]]:
     if not set(TRAJECTORY_ARRAYS) <= set(arrays):
         raise UserError(
             f"{path} has the arrays {', '.join(arrays) or 'none'}; expected {', '.join(TRAJECTORY_ARRAYS)} "
-            f"(NuiSI, HRI-Yumi) or {', '.join(handover.ARRAYS)} (handovers)"
+            f"(NuiSI, HRI-Yumi, Bütepage) or {', '.join(handover.ARRAYS)} (handovers)"
         )
     data = listed(path, "train_data", arrays["train_data"])
     columns = np.shape(data[0])[-1] if np.ndim(data[0]) == 2 else 0
-    readers = {18: ("NuiSI", nuisi.read_file), 16: ("HRI-Yumi", yumi.read_file)}
-    if columns not in readers:
-        raise UserError(f"{path}: its trials have {columns} columns; valid: 18 (NuiSI), 16 (HRI-Yumi)")
-    title, read_file = readers[columns]
+    per_frame = np.ndim(listed(path, "train_labels", arrays["train_labels"])[0]) == 2
+    readers = {
+        (18, False): ("NuiSI", nuisi.read_file),
+        (18, True): ("Bütepage human-human", buetepage.read_file),
+        (16, True): ("HRI-Yumi", yumi.read_file),
+    }
+    if columns not in (16, 18):
+        raise UserError(f"{path}: its trials have {columns} columns; valid: 18 (NuiSI, Bütepage), 16 (HRI-Yumi)")
+    title, read_file = readers.get((columns, per_frame), readers[16, True])
     train, test = read_file(path)
     return title, train + test
 

@@ -11,7 +11,7 @@ from mild_viz.errors import UserError
 from mild_viz.trial import Dataset
 
 DATASETS = tuple(SOURCES)
-"""demo, nuisi, yumi, handover."""
+"""demo, nuisi, yumi, handover, buetepage."""
 
 
 def data_root() -> Path:
@@ -67,6 +67,10 @@ def _load(name: str, root: Path) -> Dataset:
         from mild_viz.data.yumi import read_yumi
 
         return read_yumi(root)
+    if name == "buetepage":
+        from mild_viz.data.buetepage import read_buetepage
+
+        return read_buetepage(root)
     from mild_viz.data.handover import read_handover
 
     return read_handover(root)

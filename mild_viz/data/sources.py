@@ -72,5 +72,13 @@ SOURCES: dict[str, Source] = {
             "them at"
         ),
     ),
+    "buetepage": Source(
+        (DataFile(Path("buetepage/traj_data.npz")),),
+        by_hand=(
+            "Its source is the GitHub repository souljaboy764/phd_utils, but the file's SHA-256 is not known here, and "
+            "mild_viz keeps nothing that it cannot check. Download "
+            f"{PHD_UTILS}/data_preproc/buetepage/traj_data.npz yourself and place it at"
+        ),
+    ),
 }
 """By dataset name."""

@@ -57,8 +57,8 @@ def _read_split(path: Path, split: str, arrays: dict[str, np.ndarray]) -> list[T
     for index, (data, labels) in enumerate(paired(path, arrays, split)):
         where = f"{path}: {split} trial {index}"
         frames = check_trial_array(where, data, ARM_COLUMNS + len(JOINT_NAMES))
-        action, active = _read_labels(where, labels, len(frames))
-        kept = slice(0, len(frames) // KEEP_EVERY * KEEP_EVERY, KEEP_EVERY)
+        action, active = read_labels(where, labels, len(frames))
+        kept = kept_frames(len(frames))
         trials.append(
             Trial(
                 dataset="yumi",
@@ -75,7 +75,12 @@ def _read_split(path: Path, split: str, arrays: dict[str, np.ndarray]) -> list[T
     return trials
 
 
-def _read_labels(where: str, labels: Any, n_frames: int) -> tuple[str, Int[np.ndarray, " T"]]:
+def kept_frames(n_frames: int) -> slice:
+    """Of every five frames the first, floor(n / 5) of them."""
+    return slice(0, n_frames // KEEP_EVERY * KEEP_EVERY, KEEP_EVERY)
+
+
+def read_labels(where: str, labels: Any, n_frames: int) -> tuple[str, Int[np.ndarray, " T"]]:
     """The one action of a trial, and 1 in each frame in which it is going on, from one-hot rows (T, 5)."""
     one_hot = np.asarray(labels)
     if one_hot.shape != (n_frames, NOT_ACTIVE + 1):

@@ -13,10 +13,9 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.evaluation.baselines import BASELINES, Examples
 from mild_viz.evaluation.paper import paper_rows
-from mild_viz.latent.gmr import condition
-from mild_viz.latent.hmm import forward_filter, log_emission
 from mild_viz.pairs import Windows, stack_windows
-from mild_viz.settings import VARIANTS, WINDOW
+from mild_viz.prediction import predict
+from mild_viz.settings import WINDOW
 from mild_viz.trial import Dataset, Trial
 
 
@@ -53,18 +52,10 @@ def window_errors(
 
 def predict_windows(checkpoint: Checkpoint, variant: str, data: Windows) -> Float[np.ndarray, "R Y"]:
     """Partner windows that a model predicts from the human's, conditioned on the human-only forward variable."""
-    human_human = checkpoint.robot is None
-    mean, std = checkpoint.human_vae.encode(data.human)
-    decoder = checkpoint.human_vae if human_human else checkpoint.robot_vae(variant)
-    size = mean.shape[1]
     predicted = np.empty_like(data.partner)
     for trial, action in enumerate(data.actions):
         rows = data.rows(trial)
-        hmm = checkpoint.hmm(action)
-        human_hmm = hmm.marginal(slice(0, size))
-        log_alpha, _ = forward_filter(human_hmm, log_emission(human_hmm, mean[rows]))
-        posterior = std[rows] if VARIANTS[variant].posterior_covariance else None
-        predicted[rows] = decoder.decode(condition(hmm, mean[rows], log_alpha, posterior)[0])
+        predicted[rows] = predict(checkpoint, variant, action, data.human[rows]).decoded
     return predicted
 
 
@@ -107,9 +98,8 @@ def model_rows(checkpoint: Checkpoint, trials: Sequence[Trial]) -> list[Row]:
     """Every variant of a checkpoint on the given trials of one dataset."""
     human_human = checkpoint.robot is None
     data = stack_windows(trials, checkpoint.robot.joint_names if checkpoint.robot else None)
-    variants = ("v1",) if human_human else checkpoint.variants
     rows = []
-    for variant in variants:
+    for variant in checkpoint.variants:
         predicted = predict_windows(checkpoint, variant, data)
         rows += _summaries(trials[0].dataset, variant, data, predicted, human_human)
     return rows

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mild_viz.latent import kernels
-from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows
+from mild_viz.latent.hmm import HMM, log_emission, observed_rows
 
 TRANSITION_FLOOR = 1e-6
 """Smallest transition probability: a state that was never left can still be left."""
 
 DEAD_STATE_STEPS = 2.0
 """A state that explains fewer steps than this has died and is placed anew."""
+
+LOST_DIGITS = 1e-8
+"""A variance below this part of the second moment that it is the rest of is computed anew."""
+
+Sequences = Sequence[Float[np.ndarray, "_ D"]]
 
 
 def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int, floor: float) -> HMM:
@@ -42,6 +48,40 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int,
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Sequences that lie one after the other, and what the M-step needs of them in every iteration alike."""
+
+    rows: Float[np.ndarray, "N D"]
+    ends: Int[np.ndarray, " Q"]
+    """The row after the last one of each sequence."""
+    centre: Float[np.ndarray, " D"]
+    """The mean of all rows, from which the moments are taken so that they keep their digits."""
+    moments: Float[np.ndarray, "N M"]
+    """Per row 1, z and the lower triangle of z z^T, seen from the centre: their weighted sums are one matrix product.
+
+    Zero where a step has no observation: it carries the recursion on but says nothing about the emissions.
+    """
+
+    @classmethod
+    def of(cls, sequences: Sequences | Observations) -> Observations:
+        """Prepare sequences, once for all iterations on them."""
+        if isinstance(sequences, Observations):
+            return sequences
+        rows = np.concatenate(sequences)
+        seen = observed_rows(rows)
+        centre = rows[seen].mean(0)
+        centred = (rows - centre).T
+        lower, upper = np.tril_indices(len(centred))
+        moments = np.concatenate([np.ones((1, len(rows))), centred, centred[lower] * centred[upper]])
+        moments[:, ~seen] = 0.0
+        return cls(rows, np.cumsum([len(sequence) for sequence in sequences]), centre, moments.T)
+
+    def split(self) -> list[Float[np.ndarray, "_ D"]]:
+        """The sequences, one by one."""
+        return np.split(self.rows, self.ends[:-1])
+
+
 class Expectation(NamedTuple):
     """What the E-step finds: the posterior of the hidden states, given every sequence whole."""
 
@@ -54,54 +94,47 @@ class Expectation(NamedTuple):
     log_likelihood: float
 
 
-def expectation(hmm: HMM, sequences: Sequence[Float[np.ndarray, "_ D"]]) -> Expectation:
+def expectation(hmm: HMM, sequences: Sequences | Observations) -> Expectation:
     """The E-step of EM: forward-backward over every sequence."""
-    n_states = hmm.n_states
-    stacked = np.concatenate(sequences)
-    likelihood = log_emission(hmm, stacked)
-    gamma = np.empty((len(stacked), n_states))
-    counts = np.zeros((n_states, n_states))
-    initial = np.zeros(n_states)
-    total, start = 0.0, 0
-    for sequence in sequences:
-        rows = slice(start, start + len(sequence))
-        log_alpha, log_probability = forward_filter(hmm, likelihood[rows])
-        log_beta = np.empty_like(log_alpha)
-        kernels.backward(hmm.log_transition, likelihood[rows], log_beta)
-        kernels.add_transition_counts(log_alpha, log_beta, hmm.log_transition, likelihood[rows], counts)
-        log_gamma = log_alpha + log_beta
-        log_gamma -= log_gamma.max(1, keepdims=True)
-        weights = np.exp(log_gamma)
-        gamma[rows] = weights / weights.sum(1, keepdims=True)
-        initial += gamma[start]
-        total += log_probability
-        start += len(sequence)
-    return Expectation(gamma, counts, initial, total)
+    observations = Observations.of(sequences)
+    likelihood = log_emission(hmm, observations.rows)
+    alpha, flow, gamma = (np.empty(likelihood.shape) for _ in range(3))
+    counts = np.zeros((hmm.n_states, hmm.n_states))
+    total = kernels.smooth_all(
+        hmm.initial_probs, hmm.transition_matrix, likelihood, observations.ends, alpha, flow, gamma, counts
+    )
+    counts += hmm.transition_matrix * (alpha[:-1].T @ flow[1:])
+    starts = np.append(0, observations.ends[:-1])
+    return Expectation(gamma, counts, gamma[starts].sum(0), total)
 
 
 def maximise_emissions(
-    sequences: Sequence[Float[np.ndarray, "_ D"]], gamma: Float[np.ndarray, "N S"], floor: float
+    sequences: Sequences | Observations, gamma: Float[np.ndarray, "N S"], floor: float
 ) -> tuple[Float[np.ndarray, "S D"], Float[np.ndarray, "S D D"]]:
     """The M-step of the Gaussians: means and covariances of every state, each step weighted by `gamma`.
 
     A state that explains next to nothing is placed anew. `floor` is added to the diagonal of every covariance.
     """
-    stacked = np.concatenate(sequences)
-    n_states, size = gamma.shape[1], stacked.shape[1]
-    # Steps without an observation carry the recursion on but say nothing about the emissions.
-    seen = observed_rows(stacked)
-    stacked, gamma = stacked[seen], gamma[seen]
-    mass = gamma.sum(0)
-    safe_mass = np.maximum(mass, 1e-12)
-    means = (gamma.T @ stacked) / safe_mass[:, None]
-    covariances = np.empty((n_states, size, size))
-    for state in range(n_states):
-        centred = stacked - means[state]
-        covariances[state] = (gamma[:, state, None] * centred).T @ centred / safe_mass[state]
+    observations = Observations.of(sequences)
+    n_states, size = gamma.shape[1], observations.rows.shape[1]
+    moments = gamma.T @ observations.moments
+    mass = moments[:, 0]
+    moments = moments / np.maximum(mass, 1e-12)[:, None]
+    offset = moments[:, 1 : 1 + size]
+    lower, upper = np.tril_indices(size)
+    second = np.empty((n_states, size, size))
+    second[:, lower, upper] = second[:, upper, lower] = moments[:, 1 + size :]
+    means, covariances = observations.centre + offset, second - offset[:, :, None] * offset[:, None, :]
+    # The difference has lost its digits where a state is small beside its distance from the centre.
+    variance, power = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (covariances, second))
+    for state in np.flatnonzero((variance < LOST_DIGITS * power.max(1, keepdims=True)).any(1)):
+        centred = np.nan_to_num(observations.rows - means[state])
+        weights = gamma[:, state] * observations.moments[:, 0]
+        covariances[state] = (weights[:, None] * centred).T @ centred / max(mass[state], 1e-12)
     dead = mass < DEAD_STATE_STEPS
     if dead.any():
         # Placed where the equal split in time would have put it, so that the order of states survives.
-        fresh = equal_segments(sequences, n_states, 0.0)
+        fresh = equal_segments(observations.split(), n_states, 0.0)
         means[dead], covariances[dead] = fresh.emission_means[dead], fresh.emission_covariances[dead]
     return means, covariances + floor * np.eye(size)
 
@@ -118,7 +151,7 @@ def maximise_transitions(
 
 def em_step(
     hmm: HMM,
-    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    sequences: Sequences | Observations,
     floor: float,
     transition_floor: float = TRANSITION_FLOOR,
 ) -> tuple[HMM, float]:
@@ -126,31 +159,33 @@ def em_step(
 
     `floor` is added to the diagonal of every covariance (the paper's regularisation), once an iteration.
     """
-    found = expectation(hmm, sequences)
-    means, covariances = maximise_emissions(sequences, found.gamma, floor)
+    observations = Observations.of(sequences)
+    found = expectation(hmm, observations)
+    means, covariances = maximise_emissions(observations, found.gamma, floor)
     transition = maximise_transitions(found.transitions, hmm.transition_matrix, transition_floor)
-    initial = np.maximum(found.initial / len(sequences), transition_floor)
+    initial = np.maximum(found.initial / len(observations.ends), transition_floor)
     return HMM(initial / initial.sum(), transition, means, covariances), found.log_likelihood
 
 
 def fit(
     hmm: HMM,
-    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    sequences: Sequences,
     floor: float,
     n_iterations: int,
     tolerance: float = 1e-3,
-    step: Callable[[Any, Sequence[np.ndarray], float], tuple[HMM, float]] = em_step,
+    transition_floor: float = TRANSITION_FLOOR,
+    step: Callable[[Any, Observations, float, float], tuple[HMM, float]] = em_step,
 ) -> tuple[HMM, list[float]]:
     """EM from a start until the log-likelihood per step rises by less than `tolerance`, or `n_iterations`.
 
     `step` is one iteration for the start's kind of model. Returns the model and the log-likelihood before every
     iteration.
     """
-    n_steps = sum(map(len, sequences))
+    observations = Observations.of(sequences)
     history: list[float] = []
     for _ in range(n_iterations):
-        hmm, total = step(hmm, sequences, floor)
-        converged = bool(history) and abs(total - history[-1]) < tolerance * n_steps
+        hmm, total = step(hmm, observations, floor, transition_floor)
+        converged = bool(history) and abs(total - history[-1]) < tolerance * len(observations.rows)
         history.append(total)
         if converged:
             break

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mild_viz.latent import kernels
 from mild_viz.latent.hmm import HMM, observed_rows
 
 
@@ -58,9 +59,26 @@ def condition(
     if not seen.all():
         means[~seen] = hmm.emission_means[:, size:]
         within[~seen] = _mix(weights[~seen], hmm.emission_covariances[:, size:, size:])
+    return _moments(weights, means, within)
+
+
+def mix_states(
+    weights: Float[np.ndarray, "N S"], means: Float[np.ndarray, "N S R"], covariances: Float[np.ndarray, "N S R R"]
+) -> tuple[Float[np.ndarray, "N R"], Float[np.ndarray, "N R R"]]:
+    """Mean and covariance of a mixture of Gaussians, for every step (Eqs. gmr-conditioning-mu-t and -sigma-t)."""
+    within = (weights[:, None, :] @ covariances.reshape(*weights.shape, -1)).reshape(covariances[:, 0].shape)
+    return _moments(weights, means, within)
+
+
+def _moments(
+    weights: Float[np.ndarray, "N S"], means: Float[np.ndarray, "N S R"], within: Float[np.ndarray, "N R R"]
+) -> tuple[Float[np.ndarray, "N R"], Float[np.ndarray, "N R R"]]:
+    """Mean and covariance of a mixture from the states' means and the mean of their covariances.
+
+    The spread of the means is taken about their mixture mean: the same number as the difference of second moments
+    in Eq. gmr-conditioning-sigma-t, without its cancellation.
+    """
     mean = (weights[:, None, :] @ means)[:, 0]
-    # Eq. gmr-conditioning-sigma-t, with the spread of the means taken about their mixture mean: the same
-    # number as the difference of second moments, without its cancellation.
     spread = means - mean[:, None, :]
     covariance = within + (weights[..., None] * spread).transpose(0, 2, 1) @ spread
     return mean, 0.5 * (covariance + covariance.transpose(0, 2, 1))
@@ -70,15 +88,13 @@ def _condition_on_posterior(
     hmm: HMM, human_mean: Float[np.ndarray, "N H"], human_std: Float[np.ndarray, "N H"]
 ) -> tuple[Float[np.ndarray, "N S R"], Float[np.ndarray, "N S R R"]]:
     """Conditional mean and covariance of every state (Eqs. conditioning-withcov-K-i and -mu-i); NaN where not seen."""
-    size = human_mean.shape[1]
-    mean_h, mean_r = hmm.emission_means[:, :size], hmm.emission_means[:, size:]
-    cov_rh = hmm.emission_covariances[:, size:, :size]
-    cov_hr = cov_rh.transpose(0, 2, 1)
-    posterior = human_std[:, None, :, None] ** 2 * np.eye(size)
-    innovation = hmm.emission_covariances[:, :size, :size] + posterior  # N S H H
-    gain = np.linalg.solve(innovation, np.broadcast_to(cov_hr, (len(human_mean), *cov_hr.shape))).swapaxes(2, 3)
-    means = mean_r + (gain @ (human_mean[:, None, :] - mean_h)[..., None])[..., 0]
-    return means, hmm.emission_covariances[:, size:, size:] - gain @ cov_hr
+    robot_size = hmm.emission_means.shape[1] - human_mean.shape[1]
+    means = np.empty((len(human_mean), hmm.n_states, robot_size))
+    covariances = np.empty((*means.shape, robot_size))
+    kernels.condition_states(
+        np.ascontiguousarray(human_mean), human_std**2, hmm.emission_means, hmm.emission_covariances, means, covariances
+    )
+    return means, covariances
 
 
 def _mix(weights: Float[np.ndarray, "N S"], covariances: Float[np.ndarray, "S R R"]) -> Float[np.ndarray, "N R R"]:

@@ -127,12 +127,8 @@ def observed_rows(z: Float[np.ndarray, "N D"]) -> Bool[np.ndarray, " N"]:
 
 def log_emission(hmm: HMM, z: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N S"]:
     """log N(z_n; mu_i, Sigma_i). A row of `z` with NaN is a missing observation and gives a row of zeros."""
-    inverse, offsets, constants = hmm.whitening
-    # One matrix product for all states and steps: D is small and N is large.
-    n_states, size, _ = inverse.shape
-    whitened = (z @ inverse.reshape(n_states * size, size).T).reshape(-1, n_states, size) - offsets
-    log_density = constants - 0.5 * (whitened**2).sum(2)
-    log_density[~observed_rows(z)] = 0.0
+    log_density = np.empty((len(z), hmm.n_states))
+    kernels.log_density(np.ascontiguousarray(z), *hmm.whitening, log_density)
     return log_density
 
 

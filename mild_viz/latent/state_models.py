@@ -20,7 +20,7 @@ class StateModel(NamedTuple):
     check: Callable[[Any, str], HMM]
     """Returns a model if it is valid, else raises an error that says what is wrong, and where."""
     equal_segments: Callable[[Sequence[np.ndarray], int, float], HMM]
-    em_step: Callable[[Any, Sequence[np.ndarray], float], tuple[HMM, float]]
+    em_step: Callable[[Any, em.Observations, float, float], tuple[HMM, float]]
 
 
 STATE_MODELS: Mapping[str, StateModel] = {

@@ -24,6 +24,9 @@ FOLD_VERSION = 2
 """Raise it whenever the fold changes, so that older caches are not used."""
 
 
+REACH_STARTS = 256
+"""Random postures from which the longest reach is sought; twice as many find less than a millimetre more."""
+
 JOINTED = (*TURNING, "prismatic", "fixed")
 """Joint types that may lie between the base and the end effector."""
 
@@ -67,8 +70,23 @@ class ArmChain:
 
     @cached_property
     def reach(self) -> float:
-        """Longest distance from the first joint to the end effector that the links allow [m]."""
-        return float(np.linalg.norm(self.offsets[1:, :3, 3], axis=1).sum())
+        """Longest distance from the first joint to the end effector inside the limits [m].
+
+        The links bound it; where bends or limits keep an arm from that, it is the largest distance that IK towards
+        far points in many directions finds.
+        """
+        from mild_viz.robot.kernels import solve_ik_batch
+        from mild_viz.robot.kinematics.kernels import kinematics_batch
+
+        rng = np.random.default_rng(0)
+        away = rng.normal(size=(REACH_STARTS, 3))
+        away *= 10.0 / np.linalg.norm(away, axis=1, keepdims=True)
+        starts = rng.uniform(
+            np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi), (REACH_STARTS, self.n_joints)
+        )
+        stretched = solve_ik_batch(self.arm, self.shoulder + away, starts, 1.0, 0.0)
+        distances = np.linalg.norm(kinematics_batch(self.arm, stretched)[0] - self.shoulder, axis=1)
+        return float(distances.max())
 
 
 def quaternions(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:

@@ -85,6 +85,13 @@ def in_frame(T_a_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "T 3"]) 
     return np.einsum("ij,nj->ni", T_a_b[:3, :3], points) + T_a_b[:3, 3]
 
 
+def upright(T_world_person: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation from the world (z up) to a frame that stands upright and has the person's heading."""
+    heading = np.arctan2(T_world_person[1, 0], T_world_person[0, 0])
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _extension(arm: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:
     """How far the wrist is in front of the shoulder, as a share of the arm's length."""
     return (arm[:, 2, 0] - arm[:, 0, 0]) / arm_length(arm)

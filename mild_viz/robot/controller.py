@@ -26,7 +26,7 @@ class ControlCarry(NamedTuple):
     joints: Float[np.ndarray, " J"]
     """The previous command; the resting joints before the first one."""
     flags: Int[np.ndarray, "3"]
-    """Whether a command was sent, whether contact was reached, bit mask of the states seen before it."""
+    """Whether a command was sent, how far it went, bit mask of the states seen before contact."""
 
 
 class ControlResult(NamedTuple):
@@ -64,6 +64,7 @@ def run_controller(
     decoded: Float[np.ndarray, "N J"],
     targets: Float[np.ndarray, "N 3"],
     carry: ControlCarry,
+    log_transition: Float[np.ndarray, " N"] | None = None,
 ) -> ControlResult:
     """Commands for N frames from the forward variable, the decoded joints [rad] and the human's hand [m].
 
@@ -73,6 +74,11 @@ def run_controller(
     The command is smoothed by a weighted moving average, and never leaves the limits. In the contact of a
     handshake the stiffness is lowered; the segment that decides this never returns to a state that was
     active before the first contact (no back-transition to reaching).
+
+    `log_transition` is the log probability of the transition state, which decides on the stiffness too: contact
+    begins when either a contact state or it is more likely than the state of reaching, and while no contact state has
+    been active yet, it counts as one (Sec. IK adaptation and stiffness modulation). The IK is gated by the most
+    likely state alone, as Algorithm vae-HMM-test says. None, or -inf, means that there is no such state.
 
     The given carry is not changed; go on from the result's.
     """
@@ -88,6 +94,7 @@ def run_controller(
         float(settings.smoothing),
         contact_stiffness(action, settings.stiffness),
         kernel_array(log_alpha),
+        np.full(len(log_alpha), -np.inf) if log_transition is None else kernel_array(log_transition),
         kernel_array(decoded),
         kernel_array(targets),
         joints,

@@ -15,8 +15,11 @@ from mild_viz.robot.kinematics.kernels import LOWER, UPPER, arm_forward, arm_jac
 BASE_IK, MILD, MILD_IK = 0, 1, 2
 """Controllers, in the order of `settings.CONTROLLERS`."""
 
-STARTED, IN_CONTACT, VISITED = 0, 1, 2
-"""Slots of the carry's flags: a command was sent; contact was reached; bit mask of states seen before it."""
+STARTED, PROGRESS, VISITED = 0, 1, 2
+"""Slots of the carry's flags: a command was sent; how far it went; bit mask of the states seen before contact."""
+
+REACHING, CROSSING, TOUCHING = 0, 1, 2
+"""How far an interaction went: before contact; the transition state was entered; a contact state was active."""
 
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-10
@@ -220,14 +223,21 @@ def _argmax(values, excluded):
 
 
 @njit(cache=True, fastmath=False)
+def _exceeds(log_transition, log_alpha):
+    """Whether the transition state is more likely than a state, for which it leaves 1 - P(tau) (TransitionState)."""
+    share = math.exp(log_transition)
+    return share > (1.0 - share) * math.exp(log_alpha)
+
+
+@njit(cache=True, fastmath=False)
 def control_loop(
-    arm, controller, lambda_x, lambda_q, contact_states, smoothing, contact_stiffness, log_alpha, decoded, targets,
-    previous, flags,
+    arm, controller, lambda_x, lambda_q, contact_states, smoothing, contact_stiffness, log_alpha, log_transition,
+    decoded, targets, previous, flags,
 ):  # fmt: skip
     """Algorithm vae-HMM-test from the decoded joints on, over N frames; `previous` and `flags` carry over.
 
     contact_states is a bit mask. Returns commands (N, J), the contact flag (N,) that gates the IK, and the
-    stiffness (N,). `previous` (J,) is the last command; `flags` (3,): see STARTED, IN_CONTACT, VISITED.
+    stiffness (N,). `previous` (J,) is the last command; `flags` (3,): see STARTED, PROGRESS, VISITED.
     """
     n, size = decoded.shape
     scratch = ik_scratch(size)
@@ -249,11 +259,17 @@ def control_loop(
         _copy(command, previous)
         flags[STARTED] = 1
 
-        # the segment that drives the stiffness never returns to a state seen before the first contact
+        # the segment that drives the stiffness never returns to a state seen before the first contact; until a
+        # contact state was active, the transition state is one more candidate, and counts as contact
         if contact[k]:
-            flags[IN_CONTACT] = 1
-        elif flags[IN_CONTACT] == 0:
+            flags[PROGRESS] = TOUCHING
+        elif flags[PROGRESS] == REACHING:
             flags[VISITED] |= 1 << active
-        if flags[IN_CONTACT] == 1 and (contact_states >> _argmax(log_alpha[k], flags[VISITED])) & 1 == 1:
-            stiffness[k] = contact_stiffness
+            if contact_states != 0 and _exceeds(log_transition[k], log_alpha[k, active]):
+                flags[PROGRESS] = CROSSING
+        if flags[PROGRESS] != REACHING:
+            segment = _argmax(log_alpha[k], flags[VISITED])
+            crossing = flags[PROGRESS] == CROSSING and _exceeds(log_transition[k], log_alpha[k, segment])
+            if crossing or (contact_states >> segment) & 1 == 1:
+                stiffness[k] = contact_stiffness
     return commands, contact, stiffness

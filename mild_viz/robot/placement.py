@@ -1,6 +1,6 @@
 """Where the human stands, seen from the robot: from the recording, estimated, or chosen.
 
-The robot takes the partner's place, but its arm is shorter (Pepper's is about 0.65 of a person's). So the
+The robot takes the partner's place, but its arm has another length (Pepper's is about 0.65 of a person's). So the
 human is put such that contact lies at the same fraction of reach from the robot's shoulder as it lay from
 the partner's, and as well as one place allows in the same direction: at s_r + k (w_p - s_p), with
 k = reach of the robot / length of the partner's arm. This settles the height too, as if the robot stood on
@@ -19,7 +19,8 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
-from mild_viz.robot.contact import arm_length, contact_frames, in_frame
+from mild_viz.robot.contact import arm_length, contact_frames, in_frame, upright
+from mild_viz.robot.retarget_arm import scaled_wrist
 from mild_viz.settings import Placement
 from mild_viz.trial import Trial
 
@@ -31,9 +32,6 @@ SCALE = 0.03
 
 DIRECTION = 0.5
 """Weight of an error across the arm against one along it, which costs reach."""
-
-LARGEST_FRACTION = 0.9
-"""The robot meets the human at this fraction of its reach at most, since a stretched arm cannot adapt."""
 
 OUTSTRETCHED = 0.85
 """Fraction of reach at which people meet, where no recording shows it (NuiSI: 0.86 to 0.9)."""
@@ -134,11 +132,8 @@ def recorded_placement(chain: ArmChain, trial: Trial) -> PlacedHuman | None:
     world_human, world_partner, partner = trial.T_world_human, trial.T_world_partner, trial.partner_arm
     if world_human is None or world_partner is None or partner is None:
         return None
-    heading = np.arctan2(world_partner[1, 0], world_partner[0, 0])
-    upright = np.array(
-        [[np.cos(heading), np.sin(heading), 0.0], [-np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
-    )
-    human_rotation, partner_rotation = upright @ world_human[:3, :3], upright @ world_partner[:3, :3]
+    stands = upright(world_partner)
+    human_rotation, partner_rotation = stands @ world_human[:3, :3], stands @ world_partner[:3, :3]
     sample = _meetings(chain, trial, human_rotation, partner_rotation)
     if len(sample.points):
         translation = fit_translation([sample]).translation
@@ -149,7 +144,7 @@ def recorded_placement(chain: ArmChain, trial: Trial) -> PlacedHuman | None:
             in_frame(world_human, shoulder[None])[0] - in_frame(world_partner, np.nanmedian(partner[:, :1], axis=0))[0]
         )
         shrink = (human_arm + chain.reach) / (human_arm + partner_arm)
-        translation = chain.shoulder + shrink * upright @ apart - human_rotation @ shoulder
+        translation = chain.shoulder + shrink * stands @ apart - human_rotation @ shoulder
     if not np.isfinite(translation).all():
         return None
     source = "recorded: the robot takes the partner's place, nearer as its arm is shorter"
@@ -193,11 +188,9 @@ def _meetings(
     if trial.partner_arm is None:
         return Sample(np.empty((0, 3)), np.empty((0, 3, 3)))
     touching = contact_frames(trial)
-    partner = trial.partner_arm[touching]
-    reach = (partner[:, 2] - partner[:, 0]) @ partner_rotation.T / arm_length(trial.partner_arm)
-    fraction = np.linalg.norm(reach, axis=1, keepdims=True)
-    along = reach / fraction
-    meeting = chain.shoulder + chain.reach * np.minimum(fraction, LARGEST_FRACTION) * along
+    meeting = scaled_wrist(chain, trial.partner_arm, partner_rotation)[touching]
+    along = meeting - chain.shoulder
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
     weights = DIRECTION**2 * np.eye(3) + (1.0 - DIRECTION**2) * along[:, :, None] * along[:, None, :]
     return Sample(meeting - trial.human_arm[touching, 2] @ human_rotation.T, weights)
 

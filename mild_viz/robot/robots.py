@@ -41,6 +41,40 @@ Pepper's end effector lies on the wrist's axis, so that none of them moves it.
 """
 
 
+PANDA_JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
+"""The arm of the Panda from its base to its flange."""
+
+PANDA_FINGERS: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
+PANDA_REST = {
+    "panda_joint2": -0.785398,
+    "panda_joint4": -2.356194,
+    "panda_joint6": 2.6,
+    "panda_joint7": 0.785398,
+    "panda_finger_joint1": 0.02,
+    "panda_finger_joint2": 0.02,
+}
+"""The maker's ready pose [rad], but the hand raised until it points forward, 30 degrees below the horizontal; the
+fingers stand as if they held something [m]."""
+
+PANDA_HANDS = {
+    action: dict.fromkeys(PANDA_FINGERS, opening)
+    for action, opening in (("wave", 0.04), ("handshake", 0.04), ("rocket", 0.0), ("parachute", 0.0))
+}
+"""The fingers: open in a wave, closed in a bump, at rest (holding the object) in a handover [m]."""
+
+YUMI_NUMBERS = (1, 2, 7, 3, 4, 5, 6)
+"""ABB's numbers of an arm's joints from the body to the wrist: also the column order of the recordings."""
+
+YUMI_JOINTS = tuple(f"yumi_joint_{number}_r" for number in YUMI_NUMBERS)
+YUMI_READY = (0.9, -1.47, -2.19, 0.06, 1.36, 0.18, 1.43)
+YUMI_REST = {
+    f"yumi_joint_{number}_{side}": angle * (sign if number in (1, 7, 4, 6) else 1.0)
+    for side, sign in (("r", 1.0), ("l", -1.0))
+    for number, angle in zip(YUMI_NUMBERS, YUMI_READY, strict=True)
+} | {"gripper_r_joint": 0.005, "gripper_l_joint": 0.005}
+"""Both arms as the right one stands at the start of the HRI-Yumi recordings (median), the left its mirror image."""
+
+
 @dataclass(frozen=True)
 class KnownRobot:
     """What `--robot NAME` stands for."""
@@ -51,12 +85,24 @@ class KnownRobot:
     end_effector: str
     rest: dict[str, float] = field(default_factory=dict)
     hands: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Per action, where joints beyond the controlled ones stand [rad]; they must not move the end effector."""
+    """Per action, where joints beyond the controlled ones stand [rad or m]; they must not move the end effector."""
 
 
 ROBOTS: dict[str, KnownRobot] = {
     "pepper": KnownRobot("pepper/pepper.urdf", PEPPER_JOINTS, "r_gripper", PEPPER_REST, PEPPER_HANDS),
+    "panda": KnownRobot("panda/panda.urdf", PANDA_JOINTS, "end_effector_frame", PANDA_REST, PANDA_HANDS),
+    "yumi": KnownRobot("yumi/yumi.urdf", YUMI_JOINTS, "gripper_r_tip", YUMI_REST),
 }
+
+DATASET_ROBOTS = {"demo": "pepper", "nuisi": "pepper", "buetepage": "pepper", "yumi": "yumi", "handover": "panda"}
+"""The robot that a dataset's models are trained for: the recorded one, else the one that the partner's arm suits."""
+
+
+def robot_of(dataset: str) -> str:
+    """Name in `ROBOTS` of the robot that models of a dataset are trained for. `UserError` for an unknown dataset."""
+    if dataset not in DATASET_ROBOTS:
+        raise UserError(f"no robot is known for dataset '{dataset}'; valid: {', '.join(DATASET_ROBOTS)}")
+    return DATASET_ROBOTS[dataset]
 
 
 def find_urdf(name_or_path: str) -> tuple[str, Path]:

@@ -8,6 +8,14 @@ from mild_viz.errors import UserError
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.settings import choose
 
+WHOLE_NUMBERS = {
+    "seeds": 256, "human_epochs": 100_000, "robot_epochs": 100_000, "hidden": 10_000, "latent_size": 1000,
+    "n_states": 1000, "batch_size": 1_000_000, "em_every": 100_000, "em_iterations": 100_000,
+    "final_em_iterations": 100_000,
+}  # fmt: skip
+"""Options that count something, and the most that each may be."""
+POSITIVE_NUMBERS = ("learning_rate", "peak_learning_rate", "covariance_floor", "gradient_clip")
+
 
 @dataclass(frozen=True)
 class TrainingOptions:
@@ -40,9 +48,17 @@ class TrainingOptions:
     """Trials of every action that are kept from training, to choose among the seeds."""
 
     def __post_init__(self) -> None:
-        for name, most in (("seeds", 256), ("human_epochs", 100_000), ("robot_epochs", 100_000)):
-            if not 1 <= getattr(self, name) <= most:
-                raise UserError(f"{name} is {getattr(self, name)}; valid: 1 to {most}")
+        for name, most in WHOLE_NUMBERS.items():
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if not 1 <= number <= most:
+                    raise UserError(f"{name} is {value}; valid: 1 to {most}")
+        for name in POSITIVE_NUMBERS:
+            if not 0 < getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number above 0")
+        for name in ("beta", "held_out"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: 0 or more")
         choose("state_model", self.state_model, list(STATE_MODELS))
         if not 0 <= self.seed < 2**31:
             raise UserError(f"seed is {self.seed}; valid: 0 to {2**31 - 1}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_tar
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.pipeline import NEWEST, infer
@@ -29,6 +32,7 @@ from mild_viz.training.human_stage import complete_rows, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
+from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Dataset, Trial
 
 ROBOT = "pepper"
@@ -80,11 +84,18 @@ def train(
     seeds: int = 4,
     epochs: int | None = None,
     out: Path = Path("runs/model"),
-    resume: bool = False,
+    resume: bool | None = False,
     seed: int = 0,
     state_model: str = "hmm",
+    options: TrainingOptions | None = None,
+    command: str | None = None,
+    quiet: bool = False,
 ) -> Checkpoint:
     """Train a model and write its folder; the stages' state lives beside it until the folder is written.
+
+    `options` stands for `seeds`, `epochs` and `seed` where a config gives them all, and `command` is then what is
+    recorded as having made the model. `resume` None: go on if there is something to go on with. `quiet`: no progress
+    bars, no word on Ctrl-C.
 
     Raises:
         UserError: on an unknown dataset, stage, variant or state model, a dataset without a second human, a run that
@@ -94,9 +105,15 @@ def train(
     variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
     if not variants:
         raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
-    options = TrainingOptions(seeds=seeds, seed=seed, state_model=state_model)
-    if epochs is not None:
-        options = replace(options, human_epochs=epochs, robot_epochs=epochs)
+    if options is None:
+        options = TrainingOptions(seeds=seeds, seed=seed)
+        if epochs is not None:
+            options = replace(options, human_epochs=epochs, robot_epochs=epochs)
+    if command is None:
+        words = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
+        words += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
+        words += ["--seed", str(seed)] if seed else []
+        command = shlex.join([*words, "--out", str(out)])
     check_checkpoint_target(out)
     source = load_dataset(dataset)
     fit, held = hold_out(source.train, options.held_out)
@@ -104,37 +121,59 @@ def train(
     robot_data = training_windows(fit, ROBOTS[ROBOT].joint_names) if stage == "hri" else None
     description = {"dataset": dataset, "checksum": source.checksum, "stage": stage, "variants": list(variants)}
     started = time.monotonic()
-    with RunState(out, description, options, resume) as state:
-        candidates = _train_stages(source, human_data, robot_data, variants, options, state, out)
+    try:
+        with RunState(out, description, options, resume) as state:
+            candidates = _train_stages(source, human_data, robot_data, variants, options, state, out, quiet)
+            made = {"command": command, "run": description, "seconds": round(time.monotonic() - started, 1)}
+            saved = _save_best(candidates, source, fit, held, options, made, out)
+            state.finish()
+            return saved
+    except KeyboardInterrupt:
+        if not quiet:
+            print(f"interrupted; what is done is kept. Go on with:\n  {command} --resume", file=sys.stderr)
+        raise
+
+
+def _save_best(
+    candidates: Sequence[Checkpoint],
+    source: Dataset,
+    fit: Sequence[Trial],
+    held: Sequence[Trial],
+    options: TrainingOptions,
+    made: Mapping[str, Any],
+    out: Path,
+) -> Checkpoint:
+    """Choose among the candidates on held-out trials, measure the one chosen, and write its folder."""
     best, scores = choose_seed(candidates, held)
     chosen = candidates[best]
-    command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
-    command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
-    command += ["--seed", str(seed)] if seed else []
-    command += ["--state-model", state_model] if state_model != TrainingOptions.state_model else []
-    command += ["--out", str(out)]
     training = {
-        "command": shlex.join(command),
-        "seed": seed,
+        **made,
+        "seed": options.seed,
         "chosen": best,
-        "seconds": round(time.monotonic() - started, 1),
         "fitted_trials": len(source.train) - len(held),
         "held_out_trials": [trial.name for trial in held],
         "options": asdict(options),
     }
     # The test split is read here for the first time, for the record only.
     test = model_rows(chosen, [trial for trial in source.test if trial.action in chosen.actions])
-    metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
+    held_out = model_rows(chosen, held) if held else []
+    metrics = {
+        "held_out": scores,
+        "held_out_rows": [row.as_dict() for row in held_out],
+        "test": [row.as_dict() for row in test],
+    }
     chosen = replace(chosen, training=training, metrics=metrics)
     if chosen.robot is not None:
+        contact = contact_states(chosen, fit)
+        # the HMMs were fitted to the human VAE's latents of both people
+        fitted = InteractionModel(chosen.human_vae, chosen.hmms, chosen.human_vae)
         chosen = replace(
             chosen,
-            contact_states=contact_states(chosen, fit),
+            contact_states=contact,
+            transition_states=learn_transition_states(fitted, contact, human_data),
             placement=contact_placement(source.train),
         )
-    saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
-    state.finish()
-    return saved
+    return save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
 
 
 def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
@@ -175,6 +214,7 @@ def _train_stages(
     options: TrainingOptions,
     state: RunState,
     out: Path,
+    quiet: bool,
 ) -> list[Checkpoint]:
     """Both stages (only the first without robot data) with a progress bar each. Returns one candidate a seed."""
     # One thread: two are slower than one for networks of this size.
@@ -185,7 +225,7 @@ def _train_stages(
         TextColumn("{task.fields[values]}"),
     )  # fmt: skip
     try:
-        with Progress(*columns, console=Console(stderr=True)) as bars:
+        with Progress(*columns, console=Console(stderr=True), disable=quiet) as bars:
             tasks = {
                 "human": bars.add_task("human", total=options.human_epochs, values=""),
                 "robot": bars.add_task("robot", total=options.robot_epochs, values="", visible=robot_data is not None),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from palette import DARK, GREY, LIGHT, WHITE
-from surfaces import X_AXIS, Y_AXIS, Array, Colour, Loft, Piece, body, ellipsoid, revolve, shell, spline, tube
+from modelling.palette import DARK, GREY, LIGHT, WHITE
+from modelling.surfaces import X_AXIS, Y_AXIS, Array, Colour, Loft, Piece, body, ellipsoid, revolve, shell, spline, tube
 
 HAND_OPENING = 0.7
 """The value of the hand joint for which the fingers are drawn: relaxed, ready to be shaken."""

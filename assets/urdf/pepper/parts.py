@@ -9,9 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from palette import BLACK, DARK, GREY, LED, LIGHT, SCREEN, WHITE
+from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, SCREEN, WHITE
+from modelling.surfaces import (
+    Y_AXIS,
+    Array,
+    Colour,
+    LobedLoft,
+    Loft,
+    Piece,
+    body,
+    disc_decal,
+    ellipsoid,
+    revolve,
+    shell,
+    slab,
+)
 from scipy.interpolate import PchipInterpolator
-from surfaces import Y_AXIS, Array, Colour, LobedLoft, Loft, Piece, body, disc_decal, ellipsoid, revolve, shell, slab
 
 PI = np.pi
 

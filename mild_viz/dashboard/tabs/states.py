@@ -55,13 +55,14 @@ class StatesTab:
         for state, box in enumerate(self._boxes):
             box.visible = state < n_states
 
-    def read(self, checkpoint: Checkpoint, action: str) -> frozenset[int]:
+    def read(self, checkpoint: Checkpoint, variant: str, action: str) -> frozenset[int]:
         """The ticked states. Another model or action brings its own default."""
-        if len(self._boxes) < checkpoint.n_states or self._of[:1] != (checkpoint.human_vae,):
+        human = checkpoint.members(variant)[0].human_vae
+        if len(self._boxes) < checkpoint.n_states or self._of[:1] != (human,):
             self._build(checkpoint.n_states)
-        if self._of != (checkpoint.human_vae, action):
-            self._of = (checkpoint.human_vae, action)
-            self.tick(checkpoint.contact_states.get(action, frozenset()))
+        if self._of != (human, action):
+            self._of = (human, action)
+            self.tick(checkpoint.contact_states_of(variant, action))
         return frozenset(state for state in range(checkpoint.n_states) if self._boxes[state].value)
 
     def tick(self, states: frozenset[int]) -> None:

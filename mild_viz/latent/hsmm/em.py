@@ -8,7 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.latent import em
-from mild_viz.latent.em import TRANSITION_FLOOR, maximise_emissions, maximise_transitions
+from mild_viz.latent.em import (
+    TRANSITION_FLOOR,
+    Observations,
+    Sequences,
+    maximise_emissions,
+    maximise_transitions,
+)
 from mild_viz.latent.hmm import log_emission
 from mild_viz.latent.hsmm.model import HSMM
 
@@ -38,7 +44,7 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int,
 
 def em_step(
     hsmm: HSMM,
-    sequences: Sequence[Float[np.ndarray, "_ D"]],
+    sequences: Sequences | Observations,
     floor: float,
     transition_floor: float = TRANSITION_FLOOR,
     prior_segments: float = 1.0,
@@ -48,20 +54,21 @@ def em_step(
     `floor` is added to the diagonal of every covariance, once an iteration. Each state's spread of durations counts
     as many as `prior_segments` more segments with `RELATIVE_STD`: a few trials alone make it too small.
     """
-    likelihood = log_emission(hsmm, np.concatenate(sequences))
+    observations = Observations.of(sequences)
+    likelihood = log_emission(hsmm, observations.rows)
     transitions, durations = np.zeros(hsmm.transition_matrix.shape), np.zeros(hsmm.log_durations.shape)
     gamma, initial, total, start = np.empty(likelihood.shape), np.zeros(hsmm.n_states), 0.0, 0
-    for sequence in sequences:
-        rows = slice(start, start + len(sequence))
+    for end in observations.ends:
+        rows = slice(start, end)
         log_gamma, log_probability = hsmm.count(likelihood[rows], transitions, durations)
         gamma[rows] = np.exp(log_gamma)
         initial += gamma[start]
         total += log_probability
-        start += len(sequence)
-    means, covariances = maximise_emissions(sequences, gamma, floor)
+        start = end
+    means, covariances = maximise_emissions(observations, gamma, floor)
     transition = maximise_transitions(transitions, hsmm.transition_matrix, transition_floor)
-    initial = np.maximum(initial / len(sequences), transition_floor)
-    duration_means, duration_stds = maximise_durations(durations, sequences, prior_segments)
+    initial = np.maximum(initial / len(observations.ends), transition_floor)
+    duration_means, duration_stds = maximise_durations(durations, observations.split(), prior_segments)
     new = HSMM(initial / initial.sum(), _without_returns(transition), means, covariances, duration_means, duration_stds)
     return new, total
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surfaces import Colour
+from modelling.surfaces import Colour
 
 WHITE: Colour = (236, 237, 240)
 LIGHT: Colour = (196, 198, 204)
