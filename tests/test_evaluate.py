@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,13 +26,14 @@ from mild_viz.evaluation.baselines import (
     leave_one_trial_out,
 )
 from mild_viz.evaluation.layout import comparison_table, error_table
-from mild_viz.evaluation.metrics import Measured, Row
+from mild_viz.evaluation.metrics import Row
 from mild_viz.evaluation.report import REFERENCE, Evaluation, evaluate, load_named, measure
 from mild_viz.evaluation.runs import best_and_median, over_recorded_seeds
 from mild_viz.evaluation.significance import POOLED
 from mild_viz.evaluation.tables import latex_text, to_latex, to_markdown
 from mild_viz.pairs import check_rate
 from mild_viz.paths import default_checkpoint
+from mild_viz.settings import VARIANTS
 from tests.models import random_checkpoint
 
 SEEDS = ("best", "middle", "worst_1")
@@ -120,8 +120,11 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_the_json_holds_rows_and_comparisons(written: dict[str, Any]) -> None:
     content = json.loads(written["json"])
     assert set(content["rows"][0]) == {"dataset", "model", "action", "mse_mean", "mse_std", "n_windows", "n_trials"}
+    assert {row["model"] for row in content["rows"]} == {*VARIANTS, *BASELINES}
+    mean = pd.DataFrame(content["rows"]).groupby("model").mse_mean.mean()
+    assert mean["v3.1"] < 0.5 * mean["constant"]
     pairs = {(one["first"], one["second"]) for one in content["comparisons"]}
-    assert pairs == {(variant, REFERENCE) for variant in ("v1", "v2.1", "v2.2", "v3.1", "v3.2")}
+    assert pairs == {(variant, REFERENCE) for variant in VARIANTS}
     single = next(one for one in content["comparisons"] if one["action"] == "wave")
     assert (single["n_trials"], single["smallest_p"], single["conclusion"]) == (4, 0.125, "too few trials")
     best = [one for one in content["over_runs"] if (one["model"], one["statistic"]) == ("v3.1", "best")]
@@ -134,12 +137,12 @@ def test_the_csv_is_a_table_of_all_errors(written: dict[str, Any], tmp_path: Pat
     (tmp_path / "a.csv").write_text(written["csv"], encoding="utf-8")
     table = pd.read_csv(tmp_path / "a.csv")
     rows = json.loads(written["json"])["rows"]
-    plain = table[table.statistic.isna() & (table.action != "mean")]
+    plain = table.query("statistic.isna() and action != 'mean'")
     np.testing.assert_allclose(plain.mse_mean, [row["mse_mean"] for row in rows])
-    of_ridge = table[(table.model == "ridge") & table.statistic.isna()].set_index("action").mse_mean
+    of_ridge = table.query("model == 'ridge'").set_index("action").mse_mean
     assert of_ridge["mean"] == pytest.approx(of_ridge.drop("mean").mean())
-    median = table[(table.model == "v3.1") & (table.statistic == "median")].set_index("action")
-    v31 = plain[plain.model == "v3.1"].set_index("action").mse_mean
+    median = table.query("model == 'v3.1' and statistic == 'median'").set_index("action")
+    v31 = plain.query("model == 'v3.1'").set_index("action").mse_mean
     assert median.mse_mean["wave"] == pytest.approx(2 * v31["wave"], rel=1e-6)  # of one and three times it
 
 
@@ -209,7 +212,7 @@ def test_another_rate_is_refused_by_both_rates(demo: Any) -> None:
 
 def test_unknown_names_are_refused(demo: Any) -> None:
     models = {"a": random_checkpoint(1, ("v1",)), "b": random_checkpoint(2, ("v1",))}
-    with pytest.raises(UserError, match="--compare 'v9' is unknown; valid: constant, .*, v1, v1@a, v1@b"):
+    with pytest.raises(UserError, match="--compare 'v9' is unknown; valid: v1, v1@a, v1@b, constant, .*knn-time"):
         measure(models, demo, ("v9", "ridge"))
     with pytest.raises(UserError, match="two different names"):
         measure(models, demo, ("ridge", "ridge"))
@@ -275,15 +278,3 @@ def test_k_and_time_weight_are_chosen_by_leaving_trials_out() -> None:
     weight, k = min(scores, key=lambda pair: scores[pair])
     assert weight > 0 and scores[weight, k] < 0.2 * min(scores[0.0, k] for k in NEIGHBOURS)
     np.testing.assert_allclose(BASELINES["knn-time"](train)(train), fit_nearest(train, k, weight)(train))
-
-
-def test_measured_windows_are_those_without_gaps(dataset: Callable[[str], Any]) -> None:
-    """Models and baselines stand on the same windows, else no pair could be compared."""
-    nuisi = dataset("nuisi")
-    result = measure({"nuisi": load_checkpoint(default_checkpoint("nuisi"))}, nuisi)
-    first: Measured = result.measured[0]
-    for other in result.measured:
-        np.testing.assert_array_equal(other.trial, first.trial)
-        assert np.isfinite(other.errors).all()
-    (best,) = [one for one in result.comparisons if (one.first, one.action) == ("v3.1", POOLED)]
-    assert best.n_trials == 11 and best.conclusion == "knn-time is better"  # as the README says of simple baselines

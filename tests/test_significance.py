@@ -28,12 +28,20 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def measured(errors: Sequence[float] | np.ndarray, trial: Sequence[int], actions: Sequence[str]) -> Measured:
+def measured(
+    errors: Sequence[float] | np.ndarray, trial: Sequence[int] | np.ndarray, actions: Sequence[str]
+) -> Measured:
     return Measured("made", "model", np.asarray(errors, float), np.asarray(trial), tuple(actions))
 
 
 def compared(first: Measured, second: Measured) -> dict[str, Comparison]:
     return {one.action: one for one in compare([(("a", first), ("b", second))])}
+
+
+def only(first: Measured, second: Measured) -> Comparison:
+    """The comparison of predictors on one action."""
+    (one,) = compared(first, second).values()
+    return one
 
 
 def enumerated(differences: np.ndarray) -> float:
@@ -78,7 +86,7 @@ def test_wilcoxon_gives_the_published_value_and_that_of_enumeration() -> None:
 
 
 def test_a12_by_hand_and_the_window_test_by_enumeration() -> None:
-    one = compared(measured([1, 2, 3], [0, 0, 1], ["wave"] * 2), measured([2, 2, 4], [0, 0, 1], ["wave"] * 2))["wave"]
+    one = only(measured([1, 2, 3], [0, 0, 1], ["wave"] * 2), measured([2, 2, 4], [0, 0, 1], ["wave"] * 2))
     assert one.a12 == pytest.approx((0 + 1 + 2) / 9)  # 1 beats none; 2 ties with two; 3 beats two
     values = rng(4).normal(size=8)
     first, second = measured(values[:4], [0, 0, 1, 1], ["wave"] * 2), measured(values[4:], [0, 0, 1, 1], ["wave"] * 2)
@@ -86,7 +94,7 @@ def test_a12_by_hand_and_the_window_test_by_enumeration() -> None:
         abs(sum(values[i] > values[j] for i in chosen for j in set(range(8)) - set(chosen)) - 8)
         for chosen in combinations(range(8), 4)
     ]
-    assert compared(first, second)["wave"].mann_whitney_p == pytest.approx(np.mean(np.array(wins) >= wins[0]))
+    assert only(first, second).mann_whitney_p == pytest.approx(np.mean(np.array(wins) >= wins[0]))
 
 
 def made_pair(n_trials: int, shift: float, actions: Sequence[str] = ("wave",), seed: int = 0) -> list[Measured]:
@@ -113,7 +121,7 @@ def test_differences_are_those_of_the_table() -> None:
 
 def test_pairing_finds_what_windows_hide() -> None:
     """The trials differ by more than the models, which differ in every trial."""
-    better = compared(*made_pair(12, -0.05))["wave"]
+    better = only(*made_pair(12, -0.05))
     assert better.sign_flip_p == pytest.approx(smallest_p(12)) and better.mann_whitney_p > 0.05
     assert better.high < 0
 
@@ -188,11 +196,11 @@ def test_actions_and_their_pool_are_separate_families() -> None:
 
 
 def test_conclusions_say_what_can_be_said() -> None:
-    assert compared(*made_pair(3, -0.5))["wave"].conclusion == "too few trials"
-    assert compared(*made_pair(5, -0.5))["wave"].conclusion == "too few trials"  # p of 1/16 at best
-    assert compared(*made_pair(6, -0.5))["wave"].conclusion == "a is better"
-    assert compared(*made_pair(6, 0.5))["wave"].conclusion == "b is better"
-    assert compared(*made_pair(8, 0.0))["wave"].conclusion == "no difference shown"
+    assert only(*made_pair(3, -0.5)).conclusion == "too few trials"
+    assert only(*made_pair(5, -0.5)).conclusion == "too few trials"  # p of 1/16 at best
+    assert only(*made_pair(6, -0.5)).conclusion == "a is better"
+    assert only(*made_pair(6, 0.5)).conclusion == "b is better"
+    assert only(*made_pair(8, 0.0)).conclusion == "no difference shown"
     many = holm([comparison(0.03125, smallest=0.03125)] * 2)
     assert {one.conclusion for one in many} == {"too few for so many pairs"}
 
@@ -202,7 +210,7 @@ def test_a_prediction_that_is_no_number_shows() -> None:
     errors = first.errors.copy()
     errors[3] = np.nan
     good = compare([(("a", first), ("b", second))])
-    broken = compare([(("c", measured(errors, first.trial.tolist(), first.actions)), ("b", second))])
+    broken = compare([(("c", measured(errors, first.trial, first.actions)), ("b", second))])
     assert {one.conclusion for one in broken} == {"a prediction is not a number"}
     assert all(np.isnan([one.sign_flip_p, one.mann_whitney_p_holm, one.low]).all() for one in broken)
     mixed = holm([good[0], broken[0]])

@@ -16,6 +16,7 @@ import pandas as pd
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
+from mild_viz.evaluation.baselines import BASELINES
 from mild_viz.evaluation.layout import comparison_table, error_table, runs_table
 from mild_viz.evaluation.metrics import (
     Measured,
@@ -124,6 +125,8 @@ def measure(checkpoints: dict[str, Checkpoint], dataset: Dataset, pairs: Sequenc
                 f"checkpoint {models[0][0]} predicts {said[0]}; {name} predicts {said[1]}: their errors cannot "
                 "stand in one table; evaluate them one by one"
             )
+    chosen = choose_pairs(pairs, checkpoints)
+    recorded = [one for name, model in models for one in over_recorded_seeds(name, model, dataset.name)]
     train, test = stack_windows(dataset.train, joints), stack_windows(dataset.test, joints)
     variants = [
         replace(measured, checkpoint=name if len(models) > 1 else None)
@@ -131,23 +134,31 @@ def measure(checkpoints: dict[str, Checkpoint], dataset: Dataset, pairs: Sequenc
         for measured in measure_model(dataset.name, model, test)
     ]
     baselines = measure_baselines(dataset.name, train, test, joints is None)
-    over_runs = over_checkpoints(variants)
-    for name, model in models:
-        over_runs += over_recorded_seeds(name, model, dataset.name)
     named = {measured.model: measured for measured in baselines}
-    chosen = [(name, REFERENCE) for name in dict.fromkeys(one.model for one in variants)]
-    for name, _ in chosen:
-        named[name] = average([one for one in variants if one.model == name])
+    for variant in dict.fromkeys(one.model for one in variants):
+        named[variant] = average([one for one in variants if one.model == variant])
     named |= {f"{one.model}@{one.checkpoint}": one for one in variants if one.checkpoint}
-    if pairs:
-        chosen = list(combinations(dict.fromkeys(choose("--compare", name, list(named)) for name in pairs), 2))
-        if not chosen:
-            raise UserError(f"--compare needs two different names or more; valid: {', '.join(named)}")
-    comparisons = compare([((a, named[a]), (b, named[b])) for a, b in chosen])
-    published = published_rows(dataset.name, joints is None)
     return Evaluation(
-        dataset, checkpoints, (*variants, *baselines), tuple(published), tuple(over_runs), tuple(comparisons)
+        dataset,
+        checkpoints,
+        measured=(*variants, *baselines),
+        published=tuple(published_rows(dataset.name, joints is None)),
+        over_runs=(*over_checkpoints(variants), *recorded),
+        comparisons=tuple(compare([((a, named[a]), (b, named[b])) for a, b in chosen])),
     )
+
+
+def choose_pairs(names: Sequence[str], checkpoints: dict[str, Checkpoint]) -> list[tuple[str, str]]:
+    """The pairs that `measure` compares; an error lists the names that may be given."""
+    held = [(variant, name) for name, model in checkpoints.items() for variant in model.variants]
+    variants = list(dict.fromkeys(variant for variant, _ in held))
+    if not names:
+        return [(variant, REFERENCE) for variant in variants]
+    valid = [*variants, *(f"{variant}@{name}" for variant, name in held if len(checkpoints) > 1), *BASELINES]
+    pairs = list(combinations(dict.fromkeys(choose("--compare", name, valid) for name in names), 2))
+    if not pairs:
+        raise UserError(f"--compare needs two different names or more; valid: {', '.join(valid)}")
+    return pairs
 
 
 def average(runs: Sequence[Measured]) -> Measured:

@@ -99,8 +99,8 @@ def wilcoxon_p(differences: Float[np.ndarray, " n"]) -> float:
     differences = differences[differences != 0]
     if not len(differences):
         return 1.0
-    _, p = stats.wilcoxon(differences)
-    return float(p)
+    result: Any = stats.wilcoxon(differences)
+    return float(result.pvalue)
 
 
 def bootstrap_interval(
@@ -192,14 +192,14 @@ def compare(pairs: Sequence[tuple[tuple[str, Measured], tuple[str, Measured]]]) 
 
     Over all actions, the difference is that of the table's last column (actions count equally), trials and windows
     are pooled. Holm's correction has two families: the comparisons over all actions, which answer the question, and
-    those of single actions, which say where.
+    those of single actions, which say where. Where there is one action, it is all.
     """
     pooled, single = [], []
     for (first_name, first), (second_name, second) in pairs:
         if not np.array_equal(first.trial, second.trial) or first.actions != second.actions:
             raise ValueError(f"{first_name} and {second_name} were not measured on the same windows")
-        names = (first_name, second_name)
-        single += [_compare(first, second, names, action) for action in dict.fromkeys(first.actions)]
+        names, actions = (first_name, second_name), dict.fromkeys(first.actions)
+        single += [_compare(first, second, names, action) for action in actions if len(actions) > 1]
         pooled.append(_compare(first, second, names, POOLED))
     pooled, single = holm(pooled), holm(single)
     each = len(single) // max(len(pooled), 1)
