@@ -27,7 +27,8 @@ from mild_viz.evaluation.buetepage import (
     predict_windows,
     save_buetepage,
 )
-from mild_viz.evaluation.metrics import evaluation_rows, model_rows
+from mild_viz.evaluation.metrics import model_rows
+from mild_viz.evaluation.report import measure
 from mild_viz.pairs import stack_windows
 from mild_viz.settings import WINDOW
 from mild_viz.training.buetepage.networks import Gaussian, HumanDynamics, RobotDynamics, jensen_shannon, with_code
@@ -344,7 +345,7 @@ def test_the_command_trains_a_model_that_is_evaluated(
     assert model.training["command"].endswith(f"--seeds 2 --epochs 1 --seed 5 --out {out}")
     assert len(model.training["held_out_trials"]) == N_ACTIONS and len(model.metrics["test_seeds"]) == 2
     assert model.metrics["held_out"][model.training["chosen"]] == min(model.metrics["held_out"])
-    rows = [row for row in evaluation_rows(model, small) if row.model == BUETEPAGE]
+    rows = measure({"it": model}, small).measured[0].rows()
     assert (
         [row.as_dict() for row in rows]
         == model.metrics["test"]
