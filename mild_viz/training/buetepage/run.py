@@ -30,7 +30,8 @@ from mild_viz.training.buetepage.stages import (
 )
 from mild_viz.training.outcome import mean_error
 from mild_viz.training.progress import Progress
-from mild_viz.training.run import hold_out, robot_interface, training_windows
+from mild_viz.training.recordings import training_windows
+from mild_viz.training.run import hold_out, robot_interface
 from mild_viz.trial import Dataset, Trial
 
 
