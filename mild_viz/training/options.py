@@ -59,15 +59,15 @@ class TrainingOptions:
     """Which trials those are: from this one of the action backwards. All folds in turn are a cross-validation."""
     device: str = "cpu"
     """Where the networks train: cpu, or cuda. Random numbers are the CPU's, so that both see the same."""
-    joint_epochs: int = 24
+    joint_epochs: int = 40
     """v4: passes over the training trials."""
     members: int = 4
     """v4: models whose predictions are averaged."""
     lags: tuple[int, ...] = (10, 20)
     """v4: how many frames ago the further human latents of the context are taken."""
-    clock: float = 3.0
+    clock: float = 6.0
     """v4: height of the bumps of the context that tell the time since the trial began; 0: none."""
-    context_noise: float = 1.0
+    context_noise: float = 3.0
     """v4: variance of the noise on every number of the context [latent units squared]."""
     joint_floor: float = 1e-2
     """v4: what stands for `covariance_floor`."""
