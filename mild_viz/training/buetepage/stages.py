@@ -93,7 +93,7 @@ def _descend(
     progress: Progress,
     losses: Callable[[], Iterator[dict[str, Tensor]]],
 ) -> None:
-    """AdamW over epochs of `losses`, whose terms are added."""
+    """AdamW over epochs of `losses`, whose terms are added; they are sums over seeds, and reported as means."""
     optimizer = torch.optim.AdamW(net.parameters(), lr=options.learning_rate)
     for epoch in range(options.epochs):
         totals: dict[str, float] = {}
@@ -104,7 +104,7 @@ def _descend(
             optimizer.step()
             n_batches += 1
             for name, term in terms.items():
-                totals[name] = totals.get(name, 0.0) + float(term.detach())
+                totals[name] = totals.get(name, 0.0) + float(term.detach()) / options.seeds
         progress(stage, epoch + 1, options.epochs, {name: total / n_batches for name, total in totals.items()})
 
 
