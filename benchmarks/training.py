@@ -32,7 +32,7 @@ from mild_viz.data.load import load_dataset
 from mild_viz.latent.em import equal_segments, fit
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import VARIANTS
+from mild_viz.settings import PAPER_VARIANTS, VARIANTS
 from mild_viz.training.human_stage import HumanModel, complete_rows, standardisation, train_human_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.robot_stage import conditional_factors, train_robot_stage
@@ -73,10 +73,10 @@ def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 5, rounds: int = 
     robot_trials = trial_windows(robot_data, human_units, robot_units)
     check_same_numbers(human_trials, human_data, options)
 
-    units = epochs * np.array([seeds, seeds, seeds * len(VARIANTS), seeds * len(VARIANTS)])
+    units = epochs * np.array([seeds, seeds, seeds * len(PAPER_VARIANTS), seeds * len(PAPER_VARIANTS)])
     print(
-        f"{dataset}: {len(trials)} trials, {len(human_data.trial)} windows; {len(VARIANTS)} variants, {seeds} seeds, "
-        f"{epochs} epochs of each stage\n"
+        f"{dataset}: {len(trials)} trials, {len(human_data.trial)} windows; {len(PAPER_VARIANTS)} variants, "
+        f"{seeds} seeds, {epochs} epochs of each stage\n"
         f"alike: networks, losses, seeds, epochs, EM from the equal split after every epoch (at most "
         f"{options.em_iterations} iterations; checked to give the same numbers)\n"
         f"unlike, as the two ways are: theirs {SAMPLES} samples, batches of a trial, a network for each variant and "
@@ -115,7 +115,7 @@ def authors_way(
 
     def robot_stage(humans: Sequence[NaiveHuman]) -> None:
         for human in humans:
-            for variant in VARIANTS.values():
+            for variant in (VARIANTS[name] for name in PAPER_VARIANTS):
                 robot = NaiveRobot(robot_trials, human, variant, rng)
                 for _ in range(options.robot_epochs):
                     robot.epoch()
@@ -131,20 +131,22 @@ def our_way(human_data: Windows, robot_data: Windows, options: TrainingOptions) 
     bare = replace(options, em_iterations=0, final_em_iterations=0)
     _, without = timed(train_human_stage, human_data, bare, no_progress)
     humans, human = timed(train_human_stage, human_data, options, no_progress)
-    _, robot = timed(train_robot_stage, robot_data, humans, tuple(VARIANTS), options, no_progress)
+    _, robot = timed(train_robot_stage, robot_data, humans, PAPER_VARIANTS, options, no_progress)
     return np.array([human, without, robot, human + robot])
 
 
 def whole_protocol(dataset: str, seeds: int, authors_hours: float) -> None:
     """Run `mild-viz train` as it is: both stages, the choice of a seed, the evaluation, the saving."""
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint, seconds = timed(lambda: train(dataset, seeds=seeds, out=Path(folder) / "model"))
-    rows = [row for row in checkpoint.metrics["test"] if row["model"] in VARIANTS]
-    errors = {name: np.mean([row["mse_mean"] for row in rows if row["model"] == name]) for name in VARIANTS}
+        checkpoint, seconds = timed(
+            lambda: train(dataset, variants=PAPER_VARIANTS, seeds=seeds, out=Path(folder) / "model")
+        )
+    rows = [row for row in checkpoint.metrics["test"] if row["model"] in PAPER_VARIANTS]
+    errors = {name: np.mean([row["mse_mean"] for row in rows if row["model"] == name]) for name in PAPER_VARIANTS}
     best = min(errors, key=lambda name: errors[name])
     print(
-        f"our whole protocol, {len(VARIANTS)} variants, {seeds} seeds, both stages: {seconds:.0f} CPU seconds on one "
-        f"core (target: at most 300)\n"
+        f"our whole protocol, {len(PAPER_VARIANTS)} variants, {seeds} seeds, both stages: {seconds:.0f} CPU seconds "
+        f"on one core (target: at most 300)\n"
         f"test error of the seed that the held-out trials chose: "
         f"{', '.join(f'{name} {error:.4f}' for name, error in errors.items())}; "
         f"best {best} {errors[best]:.4f} (target: at most the published {PUBLISHED_ERROR})\n"

@@ -7,23 +7,23 @@ from collections.abc import Sequence
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
-from mild_viz import paths
-from mild_viz.cli_training import train_baseline
 from mild_viz.errors import UserError
+from mild_viz.evaluate_commands import evaluate, report
 from mild_viz.run_options import (
     OptionalInt,
     OptionalPath,
     OptionalText,
     OptionalVariant,
     RunOptions,
-    VariantName,
     check_output,
     documented,
+    leave,
 )
+from mild_viz.train_commands import sweep, train, train_baseline
 
 
 def app(
@@ -84,7 +84,7 @@ def data_list() -> None:
     """
     from mild_viz.data.commands import list_datasets
 
-    _leave(list_datasets())
+    leave(list_datasets())
 
 
 def data_fetch(name: tyro.conf.Positional[str]) -> None:
@@ -98,7 +98,7 @@ def data_fetch(name: tyro.conf.Positional[str]) -> None:
     """
     from mild_viz.data.commands import fetch
 
-    _leave(fetch(name))
+    leave(fetch(name))
 
 
 def data_check(path: tyro.conf.Positional[Path]) -> None:
@@ -111,70 +111,7 @@ def data_check(path: tyro.conf.Positional[Path]) -> None:
     """
     from mild_viz.data.commands import check
 
-    _leave(check(path))
-
-
-def train(
-    out: OptionalPath = None,
-    dataset: str = "demo",
-    stage: Literal["hhi", "hri"] = "hri",
-    variant: tuple[VariantName, ...] = ("v1", "v2.1", "v2.2", "v3.1", "v3.2"),
-    seeds: int = 4,
-    epochs: OptionalInt = None,
-    seed: int = 0,
-    resume: bool = False,
-    state_model: Literal["hmm", "hsmm"] = "hmm",
-) -> None:
-    """Train a model: Algorithms 1 and 2 of the paper.
-
-    Stage hhi trains the shared human VAE and one HMM for every interaction on human-human trials; stage hri does
-    that, and then trains the robot's VAEs on the frozen human side, all variants and seeds together. The best seed
-    is chosen on training trials that are held out, never on the test set.
-    Example: mild-viz train --dataset nuisi --out runs/nuisi --variant v3.1 v3.2 --seeds 8
-
-    Args:
-        out: Folder to write the model to; the state of an unfinished run lies beside it. Default: runs/DATASET-STAGE.
-            Example: --out runs/mine
-        dataset: Recordings of two humans to train on: demo, nuisi, handover. Example: --dataset nuisi
-        stage: How far to go: hhi (human-human) or hri (human-human, then human-robot). Example: --stage hhi
-        variant: Variants to train, one or several. Example: --variant v3.1 v3.2
-        seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
-        epochs: Passes over the training trials in each stage. Default: as in the shipped models. Example: --epochs 50
-        seed: Start of the random numbers; the same seed gives the same model. Example: --seed 1
-        resume: Go on from the state in --out, where an earlier run was interrupted.
-        state_model: Kind of state model: hmm, or hsmm with Gaussian durations of states. Example: --state-model hsmm
-    """
-    from mild_viz.training.run import train as run
-
-    made = run(
-        dataset=dataset, stage=stage, variants=variant, seeds=seeds, epochs=epochs, resume=resume, seed=seed,
-        out=out or Path("runs") / f"{dataset}-{stage}", state_model=state_model,
-    )  # fmt: skip
-    print(f"{made.path}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
-    print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {dataset}")
-
-
-def evaluate(
-    checkpoint: OptionalPath = None,
-    dataset: str = "demo",
-    json: OptionalPath = None,
-) -> None:
-    """Measure a model on the test trials, beside simple baselines and the paper's figures.
-
-    For every variant and action: mean squared error of the predicted robot windows [rad^2], its standard deviation
-    over windows, the number of windows and trials; beside them a constant mean, a time-indexed mean, ridge regression
-    and nearest neighbours fitted on the training trials. Example: mild-viz evaluate --dataset nuisi --json nuisi.json
-
-    Args:
-        checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
-        json: File for the table, as a list of rows. Default: print only. Example: --json results.json
-    """
-    if json is not None:
-        check_output(json, ".json")
-    from mild_viz.evaluation.report import evaluate as run
-
-    run(checkpoint or paths.default_checkpoint(dataset), dataset, json)
+    leave(check(path))
 
 
 def rollout(run: RunOptions, out: Path) -> None:
@@ -239,11 +176,6 @@ def import_published(file: tyro.conf.Positional[Path], out: Path) -> None:
     print(f"{out}: by its own arguments, {file.name} is {', '.join(checkpoint.variants)}")
 
 
-def _leave(status: int | None) -> None:
-    if status:
-        raise SystemExit(status)
-
-
 def _choice(commands: dict[str, Any]) -> Any:
     """A type of which tyro makes one subcommand for each entry; an entry may be a group of its own."""
     parts = [
@@ -264,7 +196,9 @@ COMMANDS = {
     "data": data,
     "train": train,
     "train-baseline": train_baseline,
+    "sweep": sweep,
     "evaluate": evaluate,
+    "report": report,
     "rollout": rollout,
     "record": record,
     "import-published": import_published,

@@ -49,12 +49,12 @@ def replace_folder(path: Path, fill: Callable[[Path], Result]) -> Result:
         try:
             built.mkdir()
             result = fill(built)
-            if target.exists():
-                os.replace(target, old)
             try:
+                if target.exists():
+                    os.replace(target, old)
                 os.replace(built, target)
-            except OSError:
-                if old.exists():
+            except BaseException:  # Ctrl-C between the two would lose the old one with the work folder
+                if old.exists() and not target.exists():
                     os.replace(old, target)
                 raise
         finally:

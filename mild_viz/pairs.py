@@ -77,6 +77,25 @@ def _chain(robot: str) -> ArmChain:
     return load_robot(robot).chain
 
 
+def check_rate(rate: float | None, model: str, trials: Sequence[Trial]) -> None:
+    """Refuse trials of another rate than a model's: windows of 5 observations would span another time.
+
+    Args:
+        rate: Frames a second of what the model was trained on [Hz]; None where that is not known.
+        model: The model's name, for the message.
+        trials: What it is to be run on.
+
+    Raises:
+        UserError: naming both rates and the first such trial.
+    """
+    for trial in trials:
+        if rate is not None and abs(trial.rate - rate) > 0.01 * rate:  # clocks of recordings are not exact
+            raise UserError(
+                f"checkpoint {model} was trained on {rate:g} Hz, trial {trial.name} has {trial.rate:g} Hz; "
+                f"valid: a dataset of {rate:g} Hz, or a model trained on this one"
+            )
+
+
 def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
     """Windows of all trials; the partner is the robot with `joint_names`, or the second human if None."""
     humans, partners, indices, steps = [], [], [], []

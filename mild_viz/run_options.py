@@ -25,6 +25,8 @@ SplitName = Literal["train", "test"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+OptionalPaths = Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="")]
+OptionalNames = Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
     VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
@@ -42,6 +44,12 @@ def documented(command: T) -> T:
     """Join the broken lines of each option's description: tyro would print the breaks of the source."""
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(command.__doc__ or ""))
     return command
+
+
+def leave(status: int | None) -> None:
+    """End the program with a status that is not 0."""
+    if status:
+        raise SystemExit(status)
 
 
 def check_output(path: Path, suffix: str) -> None:

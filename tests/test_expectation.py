@@ -68,25 +68,30 @@ def scaled(hmm: HMM, z: np.ndarray) -> tuple[float, np.ndarray]:
     return kernels.smooth_scaled(hmm.initial_probs, hmm.transition_matrix, likelihood, alpha, flow, gamma), gamma
 
 
-def test_scaled_probabilities_give_up_where_they_would_be_wrong() -> None:
+def test_scaled_probabilities_give_up_where_no_path_leads() -> None:
     hmm = left_to_right(np.random.default_rng(5))
     near, at_last = np.repeat(hmm.emission_means, 2, axis=0), np.repeat(hmm.emission_means[-1:], 4, axis=0)
     assert scaled(hmm, near)[0] == pytest.approx(forward_filter(hmm, log_emission(hmm, near))[1], abs=1e-12)
-    # No path is in the last state at once: the scale of the first step vanishes.
+    # The last state cannot be reached at once, and from anywhere else the observations are all but impossible.
     sharp = HMM(hmm.initial_probs, hmm.transition_matrix, hmm.emission_means, 1e-4 * hmm.emission_covariances)
     assert np.isnan(scaled(sharp, at_last)[0])
-    # Each step is likely given those before it, and yet what was all but impossible in the middle turns out true.
-    means, eye = np.array([[0.0], [0.0], [40.0]]), np.ones((3, 1, 1))
-    late = np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    fork = HMM(np.array([0.5, 0.0, 0.5]), late, means, eye)
-    turned = np.array([[0.0], [20.5], [40.0], [40.0]])
-    assert np.isnan(scaled(fork, turned)[0])
-    for model, z in ((sharp, at_last), (fork, turned)):
-        gamma, counts, total = by_enumeration(model, z)
-        found = expectation(model, [z])
-        np.testing.assert_allclose(found.gamma, gamma, atol=1e-12)
-        np.testing.assert_allclose(found.transitions, counts, atol=1e-12)
-        assert found.log_likelihood == pytest.approx(total, rel=1e-12)
+    gamma, counts, total = by_enumeration(sharp, at_last)
+    found = expectation(sharp, [at_last])
+    np.testing.assert_allclose(found.gamma, gamma, atol=1e-12)
+    np.testing.assert_allclose(found.transitions, counts, atol=1e-12)
+    assert found.log_likelihood == pytest.approx(total, rel=1e-12)
+
+
+def test_scaled_probabilities_give_up_where_the_ruled_out_state_turns_out_true() -> None:
+    # Two states that are never left. The first step rules one out, by 800 nats; each of the others is likely enough
+    # given those before it, but together they speak for that state, by 1000 nats.
+    hmm = HMM(np.array([0.5, 0.5]), np.eye(2), np.array([[0.0], [10.0]]), np.ones((2, 1, 1)))
+    z = np.array([-75.0] + 100 * [6.0])[:, None]
+    assert np.isnan(scaled(hmm, z)[0])
+    found = expectation(hmm, [z])
+    np.testing.assert_allclose(found.gamma, np.tile([0.0, 1.0], (101, 1)), atol=1e-12)
+    np.testing.assert_allclose(found.transitions, np.diag([0.0, 100.0]), atol=1e-10)
+    assert found.log_likelihood == pytest.approx(np.log(0.5) + log_emission(hmm, z)[:, 1].sum(), rel=1e-12)
 
 
 @settings(max_examples=40, deadline=None)
@@ -102,7 +107,7 @@ def test_expectation_follows_the_smoother_in_logarithms(seed: int, spread: float
     assert found.log_likelihood == pytest.approx(forward_filter(hmm, likelihood)[1], rel=1e-12)
 
 
-@pytest.mark.parametrize("distance", [0.0, 10.0, 1e7])
+@pytest.mark.parametrize("distance", [0.0, 10.0, 1e4, 1e7])
 def test_moments_keep_their_digits_far_from_the_centre(distance: float) -> None:
     rng = np.random.default_rng(7)
     away = distance * np.array([1.0, -1.0, 1.0])
@@ -120,7 +125,7 @@ def test_moments_keep_their_digits_far_from_the_centre(distance: float) -> None:
         mean = np.average(rows[seen], axis=0, weights=gamma[seen, state])
         np.testing.assert_allclose(means[state], mean, rtol=1e-12, atol=1e-12)
         expected = np.cov(rows[seen].T, aweights=gamma[seen, state], bias=True)
-        np.testing.assert_allclose(covariances[state] - 0.25 * np.eye(3), expected, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(covariances[state] - 0.25 * np.eye(3), expected, rtol=1e-6, atol=1e-9)
 
 
 def test_transitions_without_a_count_stay_as_they_were() -> None:

@@ -38,10 +38,11 @@ def paper(hmm: HMM, z: np.ndarray, alpha: np.ndarray, std: np.ndarray | None) ->
     return mean, np.sum([a * s for a, s in zip(alpha, second, strict=True)], axis=0) - np.outer(mean, mean)
 
 
+@pytest.mark.parametrize("size", [1, 2, 3])
 @pytest.mark.parametrize("with_covariance", [False, True])
-def test_equals_the_papers_equations(hmm: HMM, with_covariance: bool) -> None:
+def test_equals_the_papers_equations(hmm: HMM, with_covariance: bool, size: int) -> None:
     rng = np.random.default_rng(3)
-    z, std, alpha = rng.normal(size=(9, 2)), rng.uniform(0.05, 2.0, (9, 2)), rng.dirichlet(np.ones(3), 9)
+    z, std, alpha = rng.normal(size=(9, size)), rng.uniform(0.05, 2.0, (9, size)), rng.dirichlet(np.ones(3), 9)
     mean, covariance = condition(hmm, z, np.log(alpha), std if with_covariance else None)
     for n in range(9):
         expected = paper(hmm, z[n], alpha[n], std[n] if with_covariance else None)

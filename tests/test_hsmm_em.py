@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mild_viz.latent.em import fit
+from mild_viz.latent.em import TRANSITION_FLOOR, Observations, fit
 from mild_viz.latent.hmm import log_emission
 from mild_viz.latent.hsmm import HSMM, check_hsmm
 from mild_viz.latent.hsmm.em import em_step, equal_segments
@@ -70,7 +70,7 @@ def test_known_durations_explain_more_than_an_hmms(data: list[np.ndarray]) -> No
     totals = {}
     for name, entry in STATE_MODELS.items():
         model = fit_from_equal_segments(name, data, 4, 1e-3, 30)
-        totals[name] = entry.em_step(model, fresh, 1e-3)[1]
+        totals[name] = entry.em_step(model, Observations.of(fresh), 1e-3, TRANSITION_FLOOR)[1]
     assert totals["hsmm"] > totals["hmm"] + 2 * len(fresh)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from mild_viz.robot.controller import initial_carry, run_controller
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.stiffness import HANDSHAKE_STIFFNESS
 from mild_viz.settings import ControlSettings
-from tests.models import random_hmm
+from tests.models import random_hmm, random_hsmm
 
 REACH, CONTACT, RETURN = 0, 1, 2
 TOUCH = frozenset({CONTACT})
@@ -98,10 +99,11 @@ def test_steps_without_an_observation_do_not_count() -> None:
     assert fit_transition_state(marginal(), TOUCH, [z], [human], [joint]) is None
 
 
-def test_probability_is_that_of_bayes_rule() -> None:
+@pytest.mark.parametrize("make", [random_hmm, random_hsmm])
+def test_probability_is_that_of_bayes_rule(make: Callable[[np.random.Generator, int, int], HMM]) -> None:
     """Against the density of the newest observation as a ratio of brute-force likelihoods, and SciPy's Gaussian."""
     rng = np.random.default_rng(4)
-    hmm = random_hmm(rng, 4, 3)
+    hmm = make(rng, 4, 3)
     state = TransitionState(rng.normal(size=3), np.diag([0.5, 1.0, 2.0]) + 0.2, 0.07, frozenset({1}))
     z = rng.normal(size=(30, 3))
     z[12:15] = np.nan

@@ -102,6 +102,11 @@ class Buetepage:
     training: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def variants(self) -> tuple[str, ...]:
+        """As a checkpoint's: the one name under which it is measured."""
+        return (BUETEPAGE,)
+
     def _lstm(self, name: str) -> LSTM:
         return LSTM(*(self.tensors[f"{name}.{tensor}"] for tensor in ("input_weight", "recurrent_weight", "bias")))
 
@@ -130,6 +135,9 @@ class Buetepage:
 
 
 HEAD = ("head.0", "head.1", "z_mean")
+
+Measurable = Checkpoint | Buetepage
+"""What an evaluation can measure."""
 
 
 def predict_windows(model: Buetepage, data: Windows) -> Float[np.ndarray, "R Y"]:
@@ -178,7 +186,7 @@ def is_buetepage(path: Path) -> bool:
     return isinstance(config, dict) and config.get("kind") == BUETEPAGE
 
 
-def load_model(path: Path) -> Checkpoint | Buetepage:
+def load_model(path: Path) -> Measurable:
     """A MILD checkpoint or a baseline, whichever the folder holds."""
     return load_buetepage(path) if is_buetepage(path) else load_checkpoint(path)
 

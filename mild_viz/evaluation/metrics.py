@@ -7,18 +7,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.evaluation import buetepage
 from mild_viz.evaluation.baselines import BASELINES, Examples
-from mild_viz.evaluation.buetepage import BUETEPAGE, Buetepage
+from mild_viz.evaluation.buetepage import Buetepage, Measurable
 from mild_viz.evaluation.paper import paper_rows
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.prediction import predict
 from mild_viz.settings import WINDOW
-from mild_viz.trial import Dataset, Trial
+from mild_viz.trial import Trial
 
 
 @dataclass(frozen=True)
@@ -33,9 +32,48 @@ class Row:
     n_windows: int | None
     """None for the paper's rows: it does not print them."""
     n_trials: int | None
+    checkpoint: str | None = None
+    """Which of several checkpoints holds the model; None where one was measured."""
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        return {key: value for key, value in asdict(self).items() if key != "checkpoint" or value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What a predictor did on test windows: rows, tests and files derive from this.
+
+    Only windows with a gap are left out, so those that were measured on the same trials have the same windows,
+    row by row. A prediction that is not a number shows as such.
+    """
+
+    dataset: str
+    model: str
+    errors: Float[np.ndarray, " R"]
+    """Error of every window, as `window_errors` gives it."""
+    trial: Int[np.ndarray, " R"]
+    """Trial of every window, an index into `actions`."""
+    actions: tuple[str, ...]
+    """Action of every trial."""
+    checkpoint: str | None = None
+
+    def of_action(self, action: str) -> Bool[np.ndarray, " R"]:
+        """Which windows belong to trials of this action."""
+        return np.array([of == action for of in self.actions])[self.trial]
+
+    @property
+    def mean(self) -> float:
+        """Mean over actions of their mean errors."""
+        return float(np.mean([row.mse_mean for row in self.rows()]))
+
+    def rows(self) -> list[Row]:
+        """One line of the table an action."""
+        rows = []
+        for action in dict.fromkeys(self.actions):
+            errors, n = self.errors[self.of_action(action)], sum(of == action for of in self.actions)
+            mean, std = float(errors.mean()), float(errors.std())
+            rows.append(Row(self.dataset, self.model, action, mean, std, len(errors), n, self.checkpoint))
+        return rows
 
 
 def window_errors(
@@ -52,8 +90,10 @@ def window_errors(
     return squared.mean(1)
 
 
-def predict_windows(checkpoint: Checkpoint, variant: str, data: Windows) -> Float[np.ndarray, "R Y"]:
+def predict_windows(checkpoint: Measurable, variant: str, data: Windows) -> Float[np.ndarray, "R Y"]:
     """Partner windows that a model predicts from the human's, conditioned on the human-only forward variable."""
+    if isinstance(checkpoint, Buetepage):
+        return buetepage.predict_windows(checkpoint, data)
     predicted = np.empty_like(data.partner)
     for trial, action in enumerate(data.actions):
         rows = data.rows(trial)
@@ -61,65 +101,61 @@ def predict_windows(checkpoint: Checkpoint, variant: str, data: Windows) -> Floa
     return predicted
 
 
-def _summaries(dataset: str, model: str, data: Windows, predicted: np.ndarray, human_human: bool) -> list[Row]:
-    errors = window_errors(predicted, data.partner, human_human)
+def _measured(dataset: str, model: str, data: Windows, predicted: np.ndarray, human_human: bool) -> Measured:
     complete = data.complete
-    rows = []
-    for action in dict.fromkeys(data.actions):
-        trials = [trial for trial, of in enumerate(data.actions) if of == action]
-        # Only windows with a gap are left out: a prediction that is not a number must show.
-        pooled = np.concatenate([errors[data.rows(trial)][complete[data.rows(trial)]] for trial in trials])
-        if not len(pooled):
-            raise UserError(f"{dataset}: no complete window of action '{action}' to measure; check the recordings")
-        rows.append(Row(dataset, model, action, float(pooled.mean()), float(pooled.std()), len(pooled), len(trials)))
-    return rows
+    errors = window_errors(predicted[complete], data.partner[complete], human_human)
+    return Measured(dataset, model, errors, data.trial[complete], data.actions)
 
 
-def _examples(data: Windows, action: str) -> Examples:
-    of_action = np.array([of == action for of in data.actions])[data.trial]
-    keep = of_action & data.complete
-    if not keep.any():
-        raise UserError(f"no complete window of action '{action}' to fit or to measure; check the recordings")
+def _examples(data: Windows, keep: Bool[np.ndarray, " R"]) -> Examples:
     return Examples(data.human[keep], data.partner[keep], data.step[keep], data.trial[keep])
 
 
-def baseline_rows(dataset: str, train: Windows, test: Windows, human_human: bool) -> list[Row]:
-    """The simple predictors, fitted on the training windows and measured on the test windows."""
-    rows = []
+def _complete(data: Windows, action: str) -> Bool[np.ndarray, " R"]:
+    """The complete windows of an action; an error where there is none to fit or to measure."""
+    keep = np.array([of == action for of in data.actions])[data.trial] & data.complete
+    if not keep.any():
+        raise UserError(f"no complete window of action '{action}' to fit or to measure; check the recordings")
+    return keep
+
+
+def measure_baselines(dataset: str, train: Windows, test: Windows, human_human: bool) -> list[Measured]:
+    """The simple predictors, fitted on the training windows, on the test windows."""
+    actions = tuple(dict.fromkeys(test.actions))
+    fitted, measured = [_complete(train, action) for action in actions], [_complete(test, action) for action in actions]
+    results = []
     for name, fit in BASELINES.items():
-        for action in dict.fromkeys(test.actions):
-            predictor = fit(_examples(train, action))
-            examples = _examples(test, action)
-            errors = window_errors(predictor(examples), examples.partner, human_human)
-            n_trials = sum(of == action for of in test.actions)
-            rows.append(Row(dataset, name, action, float(errors.mean()), float(errors.std()), len(errors), n_trials))
-    return rows
+        predicted = np.full_like(test.partner, np.nan)
+        for known, asked in zip(fitted, measured, strict=True):
+            predicted[asked] = fit(_examples(train, known))(_examples(test, asked))
+        results.append(_measured(dataset, name, test, predicted, human_human))
+    return results
 
 
-def model_rows(checkpoint: Checkpoint | Buetepage, trials: Sequence[Trial]) -> list[Row]:
-    """Every variant of a checkpoint, or a baseline that is trained, on the given trials of one dataset."""
-    human_human = checkpoint.robot is None
-    data = stack_windows(trials, checkpoint.robot.joint_names if checkpoint.robot else None)
-    if isinstance(checkpoint, Buetepage):
-        predicted = buetepage.predict_windows(checkpoint, data)
-        return _summaries(trials[0].dataset, BUETEPAGE, data, predicted, human_human)
-    rows = []
-    for variant in checkpoint.variants:
-        predicted = predict_windows(checkpoint, variant, data)
-        rows += _summaries(trials[0].dataset, variant, data, predicted, human_human)
-    return rows
-
-
-def evaluation_rows(checkpoint: Checkpoint | Buetepage, dataset: Dataset) -> list[Row]:
-    """The whole table of one checkpoint on a dataset's test split: variants, baselines, the paper's rows."""
-    human_human = checkpoint.robot is None
-    joints = checkpoint.robot.joint_names if checkpoint.robot else None
-    train, test = stack_windows(dataset.train, joints), stack_windows(dataset.test, joints)
+def measure_model(dataset: str, checkpoint: Measurable, data: Windows) -> list[Measured]:
+    """Every variant of a checkpoint on windows of one dataset."""
+    for action in dict.fromkeys(data.actions):
+        _complete(data, action)
     return [
-        *model_rows(checkpoint, dataset.test),
-        *baseline_rows(dataset.name, train, test, human_human),
-        *(
-            Row(dataset.name, model, action, mean, std, None, None)
-            for model, action, mean, std in paper_rows(dataset.name, human_human)
-        ),
+        _measured(dataset, variant, data, predict_windows(checkpoint, variant, data), checkpoint.robot is None)
+        for variant in checkpoint.variants
+    ]
+
+
+def model_rows(checkpoint: Measurable, trials: Sequence[Trial]) -> list[Row]:
+    """Every variant of a checkpoint on the given trials of one dataset."""
+    data = stack_windows(trials, joint_names(checkpoint))
+    return [row for measured in measure_model(trials[0].dataset, checkpoint, data) for row in measured.rows()]
+
+
+def joint_names(checkpoint: Measurable) -> tuple[str, ...] | None:
+    """The joints that a model predicts; None where it predicts the second human."""
+    return checkpoint.robot.joint_names if checkpoint.robot else None
+
+
+def published_rows(dataset: str, human_human: bool) -> list[Row]:
+    """The paper's own figures for a dataset, as lines of the table."""
+    return [
+        Row(dataset, model, action, mean, std, None, None)
+        for model, action, mean, std in paper_rows(dataset, human_human)
     ]

@@ -56,7 +56,7 @@ PANDA_REST = {
 """The maker's ready pose [rad], but the hand raised until it points forward, 30 degrees below the horizontal; the
 fingers stand as if they held something [m]."""
 
-PANDA_HANDS = {
+PANDA_HANDS: dict[str, dict[str, float]] = {
     action: dict.fromkeys(PANDA_FINGERS, opening)
     for action, opening in (("wave", 0.04), ("handshake", 0.04), ("rocket", 0.0), ("parachute", 0.0))
 }

@@ -24,7 +24,10 @@ class BatchedVAE(nn.Module):
         rng: torch.Generator,
     ) -> None:
         super().__init__()
-        self.offset, self.scale = offset, scale
+        self.offset: Tensor
+        self.scale: Tensor
+        self.register_buffer("offset", offset, persistent=False)  # given by the data: a restart has them again
+        self.register_buffer("scale", scale, persistent=False)
         self.weights = nn.ParameterDict()
         for name, shape in layer_shapes(len(offset), hidden, latent_size).items():
             value = torch.zeros(n_models, *shape)
@@ -32,6 +35,19 @@ class BatchedVAE(nn.Module):
                 bound = math.sqrt(6.0 / sum(shape))  # Xavier, as in Sec. V-A
                 value.uniform_(-bound, bound, generator=rng)
             self.weights[name.replace(".", "/")] = nn.Parameter(value)
+
+    @torch.no_grad()
+    def load(self, vae: VAE, model: int | slice = slice(None)) -> None:
+        """Give a model (default: all) the weights of `vae`, in the units of these data: where fine-tuning starts."""
+        offset, scale = self.offset.cpu().numpy().astype(np.float64), self.scale.cpu().numpy().astype(np.float64)
+        own = dict(vae.weights)
+        own["encoder.0.bias"] = own["encoder.0.bias"] + own["encoder.0.weight"] @ offset
+        own["encoder.0.weight"] = own["encoder.0.weight"] * scale
+        own["output.bias"] = (own["output.bias"] - offset) / scale
+        own["output.weight"] = own["output.weight"] / scale[:, None]
+        for name, value in own.items():
+            weight = self.weights[name.replace(".", "/")][model]
+            weight.copy_(torch.tensor(value, dtype=torch.float32).expand_as(weight))
 
     def _affine(self, x: Tensor, layer: str) -> Tensor:
         key = layer.replace(".", "/")
@@ -81,3 +97,18 @@ def gaussian_kl(mean: Tensor, log_std: Tensor, prior_mean: Tensor, precision: Te
 def standard_kl(mean: Tensor, log_std: Tensor) -> Tensor:
     """KL(N(mean, diag std^2) || N(0, I)), summed over D."""
     return 0.5 * (mean**2 + torch.exp(2 * log_std) - 1 - 2 * log_std).sum(-1)
+
+
+def noise_like(x: Tensor, rng: torch.Generator) -> Tensor:
+    """Standard normal numbers of the shape of `x`: drawn on the CPU, so that every device sees the same ones."""
+    return torch.randn(x.shape, generator=rng).to(x.device)
+
+
+def sampled(mean: Tensor, log_std: Tensor, rng: torch.Generator) -> Tensor:
+    """One sample of every posterior."""
+    return mean + torch.exp(log_std) * noise_like(mean, rng)
+
+
+def squared_error(decoded: Tensor, target: Tensor) -> Tensor:
+    """Squared error (M,) summed over the window and averaged over the batch, of (M, B, X)."""
+    return ((decoded - target) ** 2).sum(-1).mean(1)

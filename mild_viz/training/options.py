@@ -5,8 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mild_viz.errors import UserError
+from mild_viz.latent.context import MAX_LAG
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.settings import choose
+
+WHOLE_NUMBERS = {
+    "seeds": 256, "human_epochs": 100_000, "robot_epochs": 100_000, "hidden": 10_000, "latent_size": 1000,
+    "n_states": 1000, "batch_size": 1_000_000, "em_every": 100_000, "em_iterations": 100_000,
+    "final_em_iterations": 100_000, "joint_epochs": 100_000, "members": 64, "lags": MAX_LAG,
+}  # fmt: skip
+"""Options that count something, and the most that each may be."""
+POSITIVE_NUMBERS = (
+    "learning_rate",
+    "peak_learning_rate",
+    "covariance_floor",
+    "gradient_clip",
+    "joint_floor",
+    "context_noise",
+)
+DEVICES = ("cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -38,11 +55,38 @@ class TrainingOptions:
     gradient_clip: float = 10.0
     held_out: int = 1
     """Trials of every action that are kept from training, to choose among the seeds."""
+    fold: int = -1
+    """Which trials those are: from this one of the action backwards. All folds in turn are a cross-validation."""
+    device: str = "cpu"
+    """Where the networks train: cpu, or cuda. Random numbers are the CPU's, so that both see the same."""
+    joint_epochs: int = 24
+    """v4: passes over the training trials."""
+    members: int = 4
+    """v4: models whose predictions are averaged."""
+    lags: tuple[int, ...] = (10, 20)
+    """v4: how many frames ago the further human latents of the context are taken."""
+    clock: bool = True
+    """v4: whether the time since the trial began is in the context."""
+    context_noise: float = 1.0
+    """v4: variance of the noise on every number of the context [latent units squared]."""
+    joint_floor: float = 1e-2
+    """v4: what stands for `covariance_floor`."""
+    joint_held_out: bool = False
+    """v4: keep the held-out trials from its training, too. It is not chosen among seeds, so that it need not."""
 
     def __post_init__(self) -> None:
-        for name, most in (("seeds", 256), ("human_epochs", 100_000), ("robot_epochs", 100_000)):
-            if not 1 <= getattr(self, name) <= most:
-                raise UserError(f"{name} is {getattr(self, name)}; valid: 1 to {most}")
+        for name, most in WHOLE_NUMBERS.items():
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if not 1 <= number <= most:
+                    raise UserError(f"{name} is {value}; valid: 1 to {most}")
+        for name in POSITIVE_NUMBERS:
+            if not 0 < getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number above 0")
+        for name in ("beta", "held_out"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: 0 or more")
         choose("state_model", self.state_model, list(STATE_MODELS))
+        choose("device", self.device, DEVICES)
         if not 0 <= self.seed < 2**31:
             raise UserError(f"seed is {self.seed}; valid: 0 to {2**31 - 1}")

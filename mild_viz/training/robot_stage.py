@@ -12,21 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from mild_viz.checkpoint import Checkpoint
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import unobserved_forward
+from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows
 from mild_viz.settings import VARIANTS, Variant
-from mild_viz.training.human_stage import (
-    HumanModel,
-    Progress,
-    StatePriors,
-    batches,
-    complete_rows,
-    standardisation,
-)
-from mild_viz.training.networks import BatchedVAE
+from mild_viz.training.human_stage import HumanModel
+from mild_viz.training.networks import BatchedVAE, noise_like, sampled, squared_error
 from mild_viz.training.options import TrainingOptions
+from mild_viz.training.priors import StatePriors, batches, complete_rows, standardisation
+from mild_viz.training.progress import HeldOut, Progress
 from mild_viz.training.state import RunState, Trainer
 
 
@@ -64,17 +61,29 @@ def train_robot_stage(
     options: TrainingOptions,
     progress: Progress,
     state: RunState | None = None,
+    init: Checkpoint | None = None,
+    held: HeldOut | None = None,
 ) -> list[dict[str, VAE]]:
-    """Algorithm 2 for every variant on every frozen human model. Returns, per human model, the robot VAEs."""
+    """Algorithm 2 for every variant on every frozen human model. Returns, per human model, the robot VAEs.
+
+    The networks start at random; at the robot VAE of `init` where that drives as many joints; or, where the human
+    stage had the robot for a partner, at the VAE that the HMMs were fitted to.
+    """
     rng = torch.Generator().manual_seed(options.seed + 1)
     usable = complete_rows(data)
-    size = options.latent_size
+    size, device = options.latent_size, options.device
     table = [(VARIANTS[name], human) for name in variants for human in humans]
     n_models = len(table)
     offset, scale = standardisation(usable.partner)
     net = BatchedVAE(n_models, offset, scale, options.hidden, size, rng)
-    x = net.standardise(torch.tensor(usable.partner, dtype=torch.float32))
-    prior = StatePriors([human.hmms for _, human in table], usable, slice(size, 2 * size))
+    for m, (variant, human) in enumerate(table):
+        if human.partner_vae is not human.vae:
+            net.load(human.partner_vae, m)
+        elif init is not None and variant.name in init.robot_vaes:
+            net.load(init.robot_vaes[variant.name], m)
+    net = net.to(device)
+    x = net.standardise(torch.tensor(usable.partner, dtype=torch.float32, device=device))
+    prior = StatePriors([human.hmms for _, human in table], usable, slice(size, 2 * size), device=device)
 
     conditional = [m for m, (variant, _) in enumerate(table) if variant.conditional_training != "none"]
     factors = [conditional_factors(table[m][1], usable, table[m][0]) for m in conditional]
@@ -84,6 +93,7 @@ def train_robot_stage(
     factor = torch.zeros(n_models, len(x), size, size)
     for m, (c, f) in zip(conditional, factors, strict=True):
         centre[m], factor[m] = torch.tensor(c, dtype=torch.float32), torch.tensor(f, dtype=torch.float32)
+    use, centre, factor = use.to(device), centre.to(device), factor.to(device)
 
     n_batches = len(batches(len(x), options.batch_size, rng))
     n_steps = options.robot_epochs * n_batches
@@ -95,20 +105,22 @@ def train_robot_stage(
         for rows in batches(len(x), options.batch_size, rng):
             target = x[rows].expand(n_models, -1, -1)
             mean, log_std = net.encode(target)
-            sample = mean + torch.exp(log_std) * torch.randn(mean.shape, generator=rng)
-            error = ((net.decode(sample) - target) ** 2).sum(-1).mean(1)
+            error = squared_error(net.decode(sampled(mean, log_std, rng)), target)
             kl = prior.kl(mean, log_std, rows).mean(1)
             c = centre[:, rows]
-            noise = torch.randn(*c.shape, 1, generator=rng)
-            spread = (factor[:, rows] @ noise)[..., 0]
+            spread = (factor[:, rows] @ noise_like(c, rng)[..., None])[..., 0]
             # One Monte-Carlo sample and the mean itself, which is what is decoded at test time.
             decoded = net.decode(torch.cat([c + spread, c], dim=1))
-            reached = ((decoded - target.repeat(1, 2, 1)) ** 2).sum(-1).mean(1) * use
+            reached = squared_error(decoded, target.repeat(1, 2, 1)) * use
             trainer.descend((error + options.beta * kl + reached).sum())
             totals["reconstruction"] += float(error.mean().detach()) / n_batches
             totals["kl"] += float(kl.mean().detach()) / n_batches
             totals["conditional"] += float(reached.sum().detach() / use.sum().clamp(min=1)) / n_batches
-        if state is not None and (epoch % options.em_every == 0 or epoch + 1 == options.robot_epochs):
-            state.save("robot", trainer.state(epoch + 1))
+        if epoch % options.em_every == 0 or epoch + 1 == options.robot_epochs:
+            if state is not None:
+                state.save("robot", trainer.state(epoch + 1))
+            if held is not None and conditional:
+                models = [InteractionModel(table[m][1].vae, table[m][1].hmms, net.export(m)) for m in conditional]
+                totals["held_out"] = held.error(models, [table[m][0].posterior_covariance for m in conditional])
         progress("robot", epoch + 1, options.robot_epochs, totals)
     return [{name: net.export(v * len(humans) + h) for v, name in enumerate(variants)} for h in range(len(humans))]

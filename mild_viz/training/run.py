@@ -3,144 +3,165 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_target, save_checkpoint
+from mild_viz.checkpoint import Checkpoint, RobotInterface, check_checkpoint_target, load_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
-from mild_viz.evaluation.metrics import Row, model_rows
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
-from mild_viz.pipeline import NEWEST, infer
-from mild_viz.robot.contact import contact_frames, suggest_contact_states
-from mild_viz.robot.model import load_robot
-from mild_viz.robot.placement import estimate_placement
-from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import VARIANTS, Placement, choose
-from mild_viz.training.human_stage import complete_rows, train_human_stage
+from mild_viz.robot.robots import ROBOTS, robot_of
+from mild_viz.settings import VARIANTS, choose
+from mild_viz.training.human_stage import HumanModel, train_human_stage
+from mild_viz.training.joint_stage import train_joint_stage
 from mild_viz.training.options import TrainingOptions
+from mild_viz.training.outcome import Candidate, Made, save_best
+from mild_viz.training.priors import complete_rows
+from mild_viz.training.progress import HeldOut, shown
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
-from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Dataset, Trial
 
-ROBOT = "pepper"
-"""The robot that models are trained for: the one whose joints can be retargeted from a second human."""
+STAGES = ("hhi", "hri")
 
 
-def hold_out(trials: Sequence[Trial], n_held: int) -> tuple[list[Trial], list[Trial]]:
-    """Split training trials into those to fit and the last `n_held` of every action, to choose a seed by.
+def hold_out(trials: Sequence[Trial], n_held: int, fold: int = -1) -> tuple[list[Trial], list[Trial]]:
+    """Split training trials into those to fit and `n_held` of every action, to choose a seed by.
 
-    An action with fewer than three trials keeps all of them.
+    Held out are trial `fold` of the action (negative: from the last one on) and those before it, going round. An
+    action with fewer than three trials keeps all of them.
     """
     held: set[int] = set()
     for action in dict.fromkeys(trial.action for trial in trials):
         of_action = [i for i, trial in enumerate(trials) if trial.action == action]
         if n_held and len(of_action) >= n_held + 2:
-            held.update(of_action[-n_held:])
+            held.update(of_action[(fold - k) % len(of_action)] for k in range(n_held))
     fit = [trial for i, trial in enumerate(trials) if i not in held]
     return fit, [trials[i] for i in sorted(held)]
 
 
-def mean_error(rows: Sequence[Row], variant: str) -> float:
-    """A variant's error, averaged over actions."""
-    return float(np.mean([row.mse_mean for row in rows if row.model == variant]))
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a run trains, on what: everything checked before anything is trained."""
+
+    source: Dataset
+    stage: str
+    variants: tuple[str, ...]
+    options: TrainingOptions
+    robot: RobotInterface | None
+    """None: the partner is the second human (stage hhi)."""
+    fit: list[Trial]
+    held: list[Trial]
+    init: Checkpoint | None
+
+    @property
+    def rate(self) -> float:
+        """Frames a second of the recordings [Hz]."""
+        return self.source.train[0].rate
+
+    @property
+    def recorded_robot(self) -> bool:
+        """Whether the partner is a robot throughout, without a second human to learn from first."""
+        return self.source.train[0].partner_arm is None
+
+    @property
+    def joints(self) -> tuple[str, ...] | None:
+        """The partner's columns: a robot's joints, or a second human's."""
+        return None if self.robot is None else self.robot.joint_names
+
+    @property
+    def shared_variants(self) -> tuple[str, ...]:
+        """Those that train on one frozen human side."""
+        return tuple(name for name in self.variants if not VARIANTS[name].own_models)
 
 
-def choose_seed(candidates: Sequence[Checkpoint], held: Sequence[Trial]) -> tuple[int, list[dict[str, float]]]:
-    """The candidate with the lowest error on held-out trials, and every candidate's errors by variant.
+def plan_run(
+    dataset: str, stage: str, variants: Sequence[str], options: TrainingOptions, init: Path | None = None
+) -> Plan:
+    """Read the recordings and check that they can be trained on.
 
-    Averaged over the variants with conditional training: they are what a robot runs, and v1's error, an order
-    larger, would decide alone.
+    Raises:
+        UserError: on an unknown name, recordings that lack what the stage needs or that differ among themselves, or an
+            `init` of other sizes.
     """
-    if not held:
-        return 0, []
-    scores = []
-    for candidate in candidates:
-        rows = model_rows(candidate, held)
-        scores.append({model: mean_error(rows, model) for model in dict.fromkeys(row.model for row in rows)})
-    deciding = [name for name in scores[0] if VARIANTS[name].conditional_training != "none"] or list(scores[0])
-    means = np.array([np.mean([score[name] for name in deciding]) for score in scores])
-    if np.isnan(means).all():
-        raise UserError("every seed diverged: no prediction on the held-out trials is a number; try another --seed")
-    return int(np.nanargmin(means)), scores
+    choose("stage", stage, STAGES)
+    variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
+    if not variants:
+        raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device 'cuda' is not here: torch finds no GPU that it can use; valid here: cpu")
+    source = load_dataset(dataset)
+    rates = sorted({trial.rate for trial in source.train})
+    if len(rates) > 1:
+        raise UserError(f"dataset '{dataset}' has trials of different rates: {rates} Hz; expected one rate")
+    if stage == "hhi" and source.train[0].partner_arm is None:
+        raise UserError(f"dataset '{dataset}' has no second human; valid for it: --stage hri")
+    robot = None
+    if stage == "hri":
+        name = robot_of(dataset)
+        robot = RobotInterface(name, ROBOTS[name].joint_names, ROBOTS[name].end_effector)
+    else:  # a human-human model is v1 by construction: its one VAE serves both, and no robot VAE is trained
+        variants = tuple(name for name in variants if VARIANTS[name].own_models or name == "v1") or ("v1",)
+    start = None if init is None else load_checkpoint(init)
+    if start is not None:
+        for name in ("hidden", "latent_size"):
+            found = start.hidden if name == "hidden" else start.human_vae.latent_size
+            if found != getattr(options, name):
+                raise UserError(f"{init}: {name} is {found}, this run has {getattr(options, name)}; they must be equal")
+    fit, held = hold_out(source.train, options.held_out, options.fold)
+    return Plan(source, stage, variants, options, robot, fit, held, start)
 
 
 def train(
     dataset: str,
     stage: str = "hri",
     variants: Sequence[str] = tuple(VARIANTS),
-    seeds: int = 4,
-    epochs: int | None = None,
+    options: TrainingOptions | None = None,
     out: Path = Path("runs/model"),
-    resume: bool = False,
-    seed: int = 0,
-    state_model: str = "hmm",
+    resume: bool | None = False,
+    init: Path | None = None,
+    tensorboard: Path | None = None,
+    command: str | None = None,
+    quiet: bool = False,
 ) -> Checkpoint:
     """Train a model and write its folder; the stages' state lives beside it until the folder is written.
 
+    `init`: the folder of a checkpoint to go on from (fine-tuning). `command` is recorded as what made the model.
+    `resume` None: go on if there is something to go on with. `quiet`: no progress bars, no word on Ctrl-C.
+
     Raises:
-        UserError: on an unknown dataset, stage, variant or state model, a dataset without a second human, a run that
-            cannot be resumed, or a folder that holds something else.
+        UserError: on anything given that cannot be used, a run that cannot be resumed, or a folder that holds
+            something else.
     """
-    choose("stage", stage, ("hhi", "hri"))
-    variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
-    if not variants:
-        raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
-    options = TrainingOptions(seeds=seeds, seed=seed, state_model=state_model)
-    if epochs is not None:
-        options = replace(options, human_epochs=epochs, robot_epochs=epochs)
     check_checkpoint_target(out)
-    source = load_dataset(dataset)
-    fit, held = hold_out(source.train, options.held_out)
-    human_data = training_windows(fit, None)
-    robot_data = training_windows(fit, ROBOTS[ROBOT].joint_names) if stage == "hri" else None
-    description = {"dataset": dataset, "checksum": source.checksum, "stage": stage, "variants": list(variants)}
-    started = time.monotonic()
-    with RunState(out, description, options, resume) as state:
-        candidates = _train_stages(source, human_data, robot_data, variants, options, state, out)
-    best, scores = choose_seed(candidates, held)
-    chosen = candidates[best]
-    command = ["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--variant", *variants]
-    command += ["--seeds", str(seeds), *(["--epochs", str(epochs)] if epochs is not None else [])]
-    command += ["--seed", str(seed)] if seed else []
-    command += ["--state-model", state_model] if state_model != TrainingOptions.state_model else []
-    command += ["--out", str(out)]
-    training = {
-        "command": shlex.join(command),
-        "seed": seed,
-        "chosen": best,
-        "seconds": round(time.monotonic() - started, 1),
-        "fitted_trials": len(source.train) - len(held),
-        "held_out_trials": [trial.name for trial in held],
-        "options": asdict(options),
+    plan = plan_run(dataset, stage, variants, options or TrainingOptions(), init)
+    command = command or shlex.join(["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--out", str(out)])
+    description = {
+        "dataset": dataset,
+        "checksum": plan.source.checksum,
+        "stage": stage,
+        "variants": list(plan.variants),
+        "init": None if init is None else str(init),
     }
-    # The test split is read here for the first time, for the record only.
-    test = model_rows(chosen, [trial for trial in source.test if trial.action in chosen.actions])
-    metrics = {"held_out": scores, "test": [row.as_dict() for row in test]}
-    chosen = replace(chosen, training=training, metrics=metrics)
-    if chosen.robot is not None:
-        contact = contact_states(chosen, fit)
-        # the HMMs were fitted to the human VAE's latents of both people
-        fitted = InteractionModel(chosen.human_vae, chosen.hmms, chosen.human_vae)
-        chosen = replace(
-            chosen,
-            contact_states=contact,
-            transition_states=learn_transition_states(fitted, contact, human_data),
-            placement=contact_placement(source.train),
-        )
-    saved = save_checkpoint(chosen, out, _readme(chosen, source, scores, best))
-    state.finish()
-    return saved
+    started = time.monotonic()
+    try:
+        with RunState(out, description, plan.options, resume) as state:
+            candidates = _train_stages(plan, state, out, quiet, tensorboard)
+            made = Made(command, description, round(time.monotonic() - started, 1))
+            saved = save_best(candidates, plan, made, out)
+            state.finish()
+            return saved
+    except KeyboardInterrupt:
+        if not quiet:
+            print(f"interrupted; what is done is kept. Go on with:\n  {command} --resume", file=sys.stderr)
+        raise
 
 
 def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
@@ -150,103 +171,76 @@ def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None)
     for action in dict.fromkeys(data.actions):
         if not any(of == action and trial in whole for trial, of in enumerate(data.actions)):
             raise UserError(f"action '{action}' has no complete window in the training trials; check the recordings")
+    still = float(complete_rows(data).partner.std(0).max())
+    if still < 1e-9:
+        raise UserError(
+            f"dataset '{trials[0].dataset}': the partner never moves in the training trials (all of "
+            f"{', '.join(joint_names or ['the arm'])} are constant); expected motion to learn"
+        )
     return data
 
 
-def contact_placement(trials: Sequence[Trial]) -> Placement | None:
-    """Where the human stands by the contact in the training trials; None where they show none."""
-    touching = [trial for trial in trials if contact_frames(trial).any()]
-    return estimate_placement(load_robot(ROBOT).chain, touching)[0] if touching else None
-
-
-def contact_states(checkpoint: Checkpoint, trials: Sequence[Trial]) -> dict[str, frozenset[int]]:
-    """Per action, the states in which the partners of the training trials touch: a start for a person's choice."""
-    result = {}
-    for action in checkpoint.actions:
-        of_action = [trial for trial in trials if trial.action == action]
-        active = [infer(checkpoint, trial, checkpoint.variants[0]).active_state for trial in of_action]
-        touching = [
-            contact_frames(trial)[NEWEST : NEWEST + len(states)]
-            for trial, states in zip(of_action, active, strict=True)
-        ]
-        result[action] = suggest_contact_states(active, touching, checkpoint.n_states)
-    return result
-
-
-def _train_stages(
-    source: Dataset,
-    human_data: Windows,
-    robot_data: Windows | None,
-    variants: Sequence[str],
-    options: TrainingOptions,
-    state: RunState,
-    out: Path,
-) -> list[Checkpoint]:
-    """Both stages (only the first without robot data) with a progress bar each. Returns one candidate a seed."""
+def _train_stages(plan: Plan, state: RunState, out: Path, quiet: bool, tensorboard: Path | None) -> list[Candidate]:
+    """All stages of a plan with a progress bar each. Returns one candidate a seed."""
+    options, joints = plan.options, plan.joints
+    human_human = plan.robot is None
+    paired = training_windows(plan.fit, joints)
+    human_data = paired if plan.recorded_robot or human_human else training_windows(plan.fit, None)
+    own = [name for name in plan.variants if VARIANTS[name].own_models]
+    joint_data = paired
+    if own and not options.joint_held_out:
+        joint_data = training_windows(plan.source.train, joints)
+    held = held_human = None
+    if plan.held:
+        held = HeldOut(stack_windows(plan.held, joints), human_human, plan.rate)
+        held_human = held if human_data is paired else HeldOut(stack_windows(plan.held, None), True, plan.rate)
+    stages = {"human": options.human_epochs}
+    if plan.robot is not None and plan.shared_variants:
+        stages["robot"] = options.robot_epochs
+    if own:
+        stages["joint"] = options.joint_epochs
     # One thread: two are slower than one for networks of this size.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    columns = (
-        TextColumn("{task.description:>6}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        TextColumn("{task.fields[values]}"),
-    )  # fmt: skip
     try:
-        with Progress(*columns, console=Console(stderr=True)) as bars:
-            tasks = {
-                "human": bars.add_task("human", total=options.human_epochs, values=""),
-                "robot": bars.add_task("robot", total=options.robot_epochs, values="", visible=robot_data is not None),
-            }
-
-            def progress(name: str, epoch: int, _: int, values: dict[str, float]) -> None:
-                text = "  ".join(f"{key} {value:.3f}" for key, value in values.items())
-                bars.update(tasks[name], completed=epoch, values=text)
-
-            humans = train_human_stage(human_data, options, progress, state)
+        with shown(stages, quiet, tensorboard) as progress:
+            humans = train_human_stage(
+                human_data, options, progress, state, not plan.recorded_robot, plan.init, held_human
+            )
             robots: list[dict[str, VAE]] = [{} for _ in humans]
-            if robot_data is not None:
-                robots = train_robot_stage(robot_data, humans, variants, options, progress, state)
+            if "robot" in stages:
+                robots = train_robot_stage(
+                    paired, humans, plan.shared_variants, options, progress, state, plan.init, held
+                )
+            joint: list[list[InteractionModel]] = [[] for _ in humans]
+            if own:
+                watched = held if options.joint_held_out else None
+                joint = train_joint_stage(joint_data, plan.rate, options, progress, state, plan.init, watched)
     finally:
         torch.set_num_threads(threads)
-    interface = RobotInterface(ROBOT, ROBOTS[ROBOT].joint_names, ROBOTS[ROBOT].end_effector)
     return [
-        Checkpoint(
-            path=out,
-            name=out.name,
-            dataset=source.name,
-            dataset_checksum=source.checksum,
-            human_vae=human.vae,
-            hmms=human.hmms,
-            robot_vaes=robots[index],
-            robot=interface if robot_data is not None else None,
-            hidden=options.hidden,
-        )
-        for index, human in enumerate(humans)
+        Candidate(_candidate(plan, out, human, robot, {own[0]: tuple(models)} if own else {}), human.as_interaction())
+        for human, robot, models in zip(humans, robots, joint, strict=True)
     ]
 
 
-def _readme(checkpoint: Checkpoint, source: Dataset, scores: Sequence[dict[str, float]], best: int) -> str:
-    """What a person reads in the checkpoint's folder."""
-    lines = [
-        f"# {checkpoint.name}",
-        "",
-        f"Trained on {source.title}, by:",
-        "",
-        f"    {checkpoint.training['command']}",
-        "",
-        f"Dataset `{source.name}`, SHA-256 `{source.checksum}`. {checkpoint.training['fitted_trials']} trials fitted; "
-        f"the best of {len(scores) or 1} seeds was chosen on {len(checkpoint.training['held_out_trials'])} held-out "
-        "training trials. Test split, read once after that:",
-        "",
-        f"    mild-viz evaluate --checkpoint {checkpoint.path} --dataset {source.name}",
-        "",
-        "| model | " + " | ".join(checkpoint.actions) + " | mean |",
-        "|---|" + "---|" * (len(checkpoint.actions) + 1),
-    ]
-    rows = checkpoint.metrics["test"]
-    for model in dict.fromkeys(row["model"] for row in rows):
-        values = [row["mse_mean"] for row in rows if row["model"] == model]
-        lines.append(f"| {model} | " + " | ".join(f"{value:.4f}" for value in [*values, float(np.mean(values))]) + " |")
-    if scores:
-        lines += ["", "Held-out error of every seed (mean over actions; chosen: " + str(best) + "):", ""]
-        lines += [f"- seed {i}: " + ", ".join(f"{k} {v:.4f}" for k, v in s.items()) for i, s in enumerate(scores)]
-    return "\n".join(lines) + "\n"
+def _candidate(
+    plan: Plan,
+    out: Path,
+    human: HumanModel,
+    robot_vaes: dict[str, VAE],
+    own_models: dict[str, tuple[InteractionModel, ...]],
+) -> Checkpoint:
+    return Checkpoint(
+        path=out,
+        name=out.name,
+        dataset=plan.source.name,
+        dataset_checksum=plan.source.checksum,
+        human_vae=human.vae,
+        hmms=human.hmms,
+        robot_vaes=robot_vaes,
+        robot=plan.robot,
+        own_models=own_models,
+        rate=plan.rate,
+        hidden=plan.options.hidden,
+    )

@@ -16,17 +16,27 @@ from mild_viz.files import write_atomically
 from mild_viz.training.options import TrainingOptions
 
 
+def state_folder(out: Path) -> Path:
+    """Where the state of an unfinished run lies: beside its output."""
+    return out.resolve().parent / f".{out.name}.training"
+
+
+class HeldError(UserError):
+    """The run's state is held by another process that is still at it."""
+
+
 class RunState:
     """A folder beside the output with the run's options and one file of tensors a stage.
 
-    One run at a time holds it, and an unfinished run is never thrown away unasked.
+    One run at a time holds it, and an unfinished run is never thrown away unasked. `resume` None: go on with what is
+    there, or start.
     """
 
-    def __init__(self, out: Path, description: dict[str, Any], options: TrainingOptions, resume: bool) -> None:
-        self.folder = out.resolve().parent / f".{out.name}.training"
+    def __init__(self, out: Path, description: dict[str, Any], options: TrainingOptions, resume: bool | None) -> None:
+        self.folder = state_folder(out)
         self._record = self.folder / "run.json"
         record = json.loads(json.dumps({**description, **asdict(options)}))
-        if not resume and self._record.exists():
+        if resume is False and self._record.exists():
             raise UserError(
                 f"{self.folder} holds an unfinished run: go on with --resume, or remove that folder to start anew"
             )
@@ -40,7 +50,8 @@ class RunState:
             ) from None
         self._lock = self._hold()
         try:
-            if resume:
+            # Only who holds the folder can say whether there is something to go on with.
+            if resume or (resume is None and self._record.is_file()):
                 self._compare(record)
             else:
                 write_atomically(self._record, lambda temporary: temporary.write_text(json.dumps(record, indent=2)))
@@ -61,7 +72,7 @@ class RunState:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             lock.close()
-            raise UserError(f"{self.folder} is held by another run that is still going on") from None
+            raise HeldError(f"{self.folder} is held by another run that is still going on") from None
         return lock
 
     def _compare(self, record: dict[str, Any]) -> None:
@@ -83,7 +94,7 @@ class RunState:
         if not file.is_file():
             return None
         try:
-            return torch.load(file, weights_only=True)
+            return torch.load(file, weights_only=True, map_location="cpu")
         except Exception:  # a damaged pickle leads torch into any of a dozen errors
             raise UserError(f"{file} is damaged; remove {self.folder} to start anew") from None
 
@@ -97,8 +108,8 @@ class RunState:
 
     def finish(self) -> None:
         """The result is written: the state is not needed any more."""
-        self.release()
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.release()  # after that: another run could have begun in the folder
 
 
 class Trainer:

@@ -68,7 +68,10 @@ def drum(low: float, high: float, radius: float) -> list[Piece]:
     profile = [(0.0, near + way * 0.005), (radius, near + way * 0.005), (radius, near + way * 0.80 * depth),
                (0.72 * radius, far), (0.0, far)]  # fmt: skip
     inner = near + way * 0.008
-    return [lathe(profile[:: int(way)], WHITE, 30, 0.012), band(0.93 * radius, min(near, inner), max(near, inner), DARK)]
+    return [
+        lathe(profile[:: int(way)], WHITE, 30, 0.012),
+        band(0.93 * radius, min(near, inner), max(near, inner), DARK),
+    ]
 
 
 def trunk() -> list[Piece]:

@@ -23,8 +23,6 @@ class BuetepageOptions:
     """Windows in a step of a VAE."""
     batch_trials: int = 4
     """Trials in a step of the dynamics."""
-    held_out: int = 1
-    """Trials of every action that are kept from training, to choose among the seeds."""
 
     def __post_init__(self) -> None:
         for name, most in (("seeds", 256), ("epochs", 100_000)):

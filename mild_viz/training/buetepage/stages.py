@@ -24,8 +24,9 @@ from mild_viz.training.buetepage.networks import (
     with_code,
 )
 from mild_viz.training.buetepage.options import BuetepageOptions
-from mild_viz.training.human_stage import Progress, batches, standardisation
 from mild_viz.training.networks import BatchedVAE, standard_kl
+from mild_viz.training.priors import batches, standardisation
+from mild_viz.training.progress import Progress
 from mild_viz.trial import Trial
 
 
