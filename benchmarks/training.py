@@ -31,12 +31,12 @@ from naive_training import SAMPLES, NaiveHMM, NaiveHuman, NaiveRobot, TrialWindo
 from mild_viz.data.load import load_dataset
 from mild_viz.latent.em import equal_segments, fit
 from mild_viz.pairs import Windows, stack_windows
-from mild_viz.robot.robots import ROBOTS
 from mild_viz.settings import PAPER_VARIANTS, VARIANTS
-from mild_viz.training.human_stage import HumanModel, complete_rows, standardisation, train_human_stage
+from mild_viz.training.human_stage import HumanModel, train_human_stage
 from mild_viz.training.options import TrainingOptions
+from mild_viz.training.priors import complete_rows, standardisation
 from mild_viz.training.robot_stage import conditional_factors, train_robot_stage
-from mild_viz.training.run import ROBOT, train
+from mild_viz.training.run import robot_interface, train
 
 PUBLISHED_ERROR = 0.042
 """Mean over the actions of NuiSI of the paper's best variant, v3.1 [rad^2]."""
@@ -63,7 +63,7 @@ def main(dataset: str = "nuisi", seeds: int = 4, epochs: int = 5, rounds: int = 
         seeds=seeds, human_epochs=epochs, robot_epochs=epochs, final_em_iterations=TrainingOptions().em_iterations
     )
     trials = load_dataset(dataset).train
-    human_data, robot_data = (stack_windows(trials, names) for names in (None, ROBOTS[ROBOT].joint_names))
+    human_data, robot_data = (stack_windows(trials, names) for names in (None, robot_interface(dataset).joint_names))
     people, usable = complete_rows(human_data), complete_rows(robot_data)
     human_units, robot_units = (
         standardisation(np.concatenate([people.human, people.partner])),
@@ -139,7 +139,9 @@ def whole_protocol(dataset: str, seeds: int, authors_hours: float) -> None:
     """Run `mild-viz train` as it is: both stages, the choice of a seed, the evaluation, the saving."""
     with tempfile.TemporaryDirectory() as folder:
         checkpoint, seconds = timed(
-            lambda: train(dataset, variants=PAPER_VARIANTS, seeds=seeds, out=Path(folder) / "model")
+            lambda: train(
+                dataset, variants=PAPER_VARIANTS, options=TrainingOptions(seeds=seeds), out=Path(folder) / "model"
+            )
         )
     rows = [row for row in checkpoint.metrics["test"] if row["model"] in PAPER_VARIANTS]
     errors = {name: np.mean([row["mse_mean"] for row in rows if row["model"] == name]) for name in PAPER_VARIANTS}
@@ -188,7 +190,9 @@ def check_same_numbers(trials: Sequence[TrialWindows], data: Windows, options: T
     np.testing.assert_allclose(naive.means, found.emission_means, atol=1e-6)
 
     for variant in (VARIANTS["v3.1"], VARIANTS["v3.2"]):
-        centre, factor = conditional_factors(HumanModel(human.vae, dict(human.hmms) | {action: found}), usable, variant)
+        centre, factor = conditional_factors(
+            HumanModel(human.vae, dict(human.hmms) | {action: found}, human.vae), usable, variant
+        )
         for row, trial in zip(rows, trials, strict=False):
             posterior = torch.tensor(std[row]) if variant.posterior_covariance else None
             answer = naive.condition(torch.tensor(mean[row]), naive.unobserved(trial.step), posterior)

@@ -15,6 +15,7 @@ from mild_viz.run_options import OptionalInt, OptionalPath, OptionalText, Varian
 
 if TYPE_CHECKING:
     from mild_viz.checkpoint import Checkpoint
+    from mild_viz.evaluation.buetepage import Buetepage
 
 
 def train(
@@ -99,7 +100,7 @@ def _train_from(
     _say_what_next(train_from_config(config, out, resume, tensorboard))
 
 
-def _say_what_next(made: Checkpoint) -> None:
+def _say_what_next(made: Checkpoint | Buetepage) -> None:
     chosen, n_seeds = made.training["chosen"], made.training["options"]["seeds"]
     print(f"{made.path}: seed {chosen} of {n_seeds} had the lowest error on held-out training trials")
     print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {made.dataset}")
@@ -123,7 +124,7 @@ def train_baseline(
     Args:
         out: Folder to write the model to. Default: runs/DATASET-buetepage, or runs/DATASET-buetepage-human.
             Example: --out runs/mine
-        dataset: Recordings to train on: demo, nuisi, yumi, handover. Example: --dataset yumi
+        dataset: Recordings to train on: demo, nuisi, yumi, handover, buetepage. Example: --dataset yumi
         human_human: Predict the second human's arm instead of a robot.
         seeds: Number of runs from different random starts to choose from; all train together. Example: --seeds 8
         epochs: Passes over the training trials in each stage. Default: 400, as the authors. Example: --epochs 50
@@ -133,8 +134,7 @@ def train_baseline(
 
     out = out or Path("runs") / f"{dataset}-buetepage{'-human' if human_human else ''}"
     made = train_buetepage(dataset, seeds, epochs, out, seed, human_human)
-    print(f"{out}: seed {made.training['chosen']} of {seeds} had the lowest error on held-out training trials")
-    print(f"next: mild-viz evaluate --checkpoint {out} --dataset {dataset}")
+    _say_what_next(made)
 
 
 def sweep(config: tyro.conf.Positional[Path], jobs: OptionalInt = None, scheduler: OptionalText = None) -> None:

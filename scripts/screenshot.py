@@ -36,6 +36,8 @@ class Options:
     dataset: str = "demo"
     action: str = "handshake"
     trial: int | None = None
+    checkpoint: Path | None = None
+    """Model to show. Default: the one that ships for the dataset."""
     at: float = 0.5
     """Moment to show, as a fraction of the trial."""
     tab: Literal["Trial", "Robot", "States", "View", "Record"] = "States"
@@ -45,13 +47,15 @@ class Options:
 
 
 @contextmanager
-def running_app(dataset: str, action: str, trial: int | None) -> Iterator[str]:
+def running_app(dataset: str, action: str, trial: int | None, checkpoint: Path | None = None) -> Iterator[str]:
     """The app in a process of its own; yields its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "app.py", "--dataset", dataset, "--action", action, "--port", str(port)]
-    process = subprocess.Popen([*command, *([] if trial is None else ["--trial", str(trial)])])
+    command += [] if trial is None else ["--trial", str(trial)]
+    command += [] if checkpoint is None else ["--checkpoint", str(checkpoint)]
+    process = subprocess.Popen(command)
     url = f"http://127.0.0.1:{port}"
     try:
         for _ in range(600):
@@ -73,7 +77,10 @@ def main(options: Options) -> None:
 
     options.out.mkdir(parents=True, exist_ok=True)
     many = len(options.size) * len(options.theme) > 1
-    with running_app(options.dataset, options.action, options.trial) as url, sync_playwright() as playwright:
+    with (
+        running_app(options.dataset, options.action, options.trial, options.checkpoint) as url,
+        sync_playwright() as playwright,
+    ):
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=list(CHROMIUM))
         for size in options.size:
             width, height = map(int, size.split("x"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from mild_viz.checkpoint import (
 )
 from mild_viz.errors import UserError
 from mild_viz.settings import VARIANTS, Placement
+from tests.disk import full_disk
 from tests.models import random_checkpoint
 
 
@@ -49,6 +51,36 @@ def test_saving_again_replaces_the_whole_folder(folder: Path) -> None:
     save_checkpoint(random_checkpoint(1, ("v3.1",)), folder, "# new\n")
     assert sorted(p.name for p in folder.iterdir()) == ["README.md", "config.json", "weights.safetensors"]
     assert load_checkpoint(folder).variants == ("v3.1",)
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+@pytest.mark.parametrize("limit", [2000, 20_000])
+def test_a_disk_that_fills_up_in_mid_save_leaves_the_old_folder(folder: Path, limit: int) -> None:
+    before = content(folder)
+    with full_disk(limit), pytest.raises(UserError, match="model cannot be written: .*File too large"):
+        save_checkpoint(random_checkpoint(1), folder, "# new\n" + 100_000 * "x")
+    assert content(folder) == before and load_checkpoint(folder).name == "random"
+    assert [p.name for p in folder.parent.iterdir()] == ["model"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_failing_swap_brings_the_old_folder_back(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, step: int
+) -> None:
+    before, moves = content(folder), []
+    move = os.replace
+
+    def replace_until(source: Path, target: Path) -> None:
+        moves.append(target)
+        if len(moves) == step:
+            raise error
+        move(source, target)
+
+    monkeypatch.setattr("mild_viz.checkpoint.folder.os.replace", replace_until)
+    with pytest.raises((UserError, KeyboardInterrupt)):
+        save_checkpoint(random_checkpoint(1), folder, "")
+    assert content(folder) == before
     assert [p.name for p in folder.parent.iterdir()] == ["model"]
 
 

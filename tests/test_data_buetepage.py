@@ -39,7 +39,7 @@ def people(n_frames: int, seed: int) -> np.ndarray:
 
 def write(root: Path, **changes: Any) -> Path:
     """A set of two training trials and one test trial; object arrays are pickles, as the authors write them."""
-    arrays = {
+    arrays: dict[str, Any] = {
         "train_data": objects(people(104, 0), people(80, 1)),
         "train_labels": objects(one_hot(104, 3, 61), one_hot(80, 0, 80)),
         "test_data": objects(people(90, 2)),

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM, forward_filter, log_emission, unobserved_forward
-from mild_viz.latent.hsmm import HSMM, check_hsmm
+from mild_viz.latent.hsmm import HSMM, check_hsmm, kernels
 from tests.models import TableHSMM, random_hmm, random_hsmm, without_returns
 
 Segments = tuple[tuple[int, int], ...]
@@ -106,8 +106,13 @@ def test_forward_filter_sums_over_all_segmentations(example: tuple[HSMM, np.ndar
     assert total == pytest.approx(np.logaddexp.reduce(list(values.values())), abs=1e-11)
 
 
-def test_smoother_and_counts_sum_over_all_segmentations(example: tuple[HSMM, np.ndarray]) -> None:
+@pytest.mark.parametrize("way", ["scaled", "logarithms"])
+def test_smoother_and_counts_sum_over_all_segmentations(
+    example: tuple[HSMM, np.ndarray], way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hsmm, z = example
+    if way == "logarithms":
+        monkeypatch.setattr(kernels, "count_scaled", lambda *_: np.nan)
     likelihood, values = log_emission(hsmm, z), segment_log_probabilities(hsmm, z)
     log_gamma = hsmm.smooth(likelihood)
     for n in range(len(z)):
@@ -169,6 +174,28 @@ def test_geometric_durations_are_the_hmm(seed: int) -> None:
     expected_path, expected_score = hmm.viterbi(likelihood)
     np.testing.assert_array_equal(path, expected_path)
     assert score == pytest.approx(expected_score, abs=1e-9)
+
+
+@pytest.mark.parametrize("spread", [1.0, 5.0, 300.0])
+def test_probabilities_and_logarithms_count_alike(spread: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where probabilities leave the range of numbers, which only logarithms bear."""
+    rng = np.random.default_rng(9)
+    hsmm = replace(random_hsmm(rng, 4, 2, 20.0, 0.5), duration_stds=np.array([1.0, 4.0, 0.5, 2.0]))
+    likelihood = log_emission(hsmm, spread * np.repeat(rng.normal(size=(8, 2)), 15, axis=0))
+    scaled, totals, found = kernels.count_scaled, [], []
+
+    def watched(*args: np.ndarray) -> float:
+        totals.append(scaled(*args))
+        return totals[-1]
+
+    for way in (watched, lambda *_: np.nan):
+        monkeypatch.setattr(kernels, "count_scaled", way)
+        transitions, durations = np.zeros((4, 4)), np.zeros(hsmm.log_durations.shape)
+        log_gamma, total = hsmm.count(likelihood, transitions, durations)
+        found.append((np.exp(log_gamma), transitions, durations, total))
+    for ours, expected in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-9, atol=1e-9)
+    assert np.isnan(totals) == [spread == 300.0]
 
 
 def test_a_last_state_that_follows_itself_is_never_left() -> None:

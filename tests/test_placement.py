@@ -13,7 +13,6 @@ from mild_viz.robot.contact import arm_length, contact_frames, in_frame, suggest
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.placement import (
     FACING,
-    LARGEST_FRACTION,
     T_world_human,
     dyad_translation,
     estimate_placement,
@@ -21,6 +20,7 @@ from mild_viz.robot.placement import (
     place_human,
     recorded_placement,
 )
+from mild_viz.robot.retarget_arm import LARGEST_FRACTION
 from mild_viz.settings import Placement
 from mild_viz.trial import CONTACT_ACTIONS, Trial
 

@@ -315,7 +315,7 @@ def test_package_paths(small_arm):
 
 
 def test_unknown_robot_and_missing_file(tmp_path):
-    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, or the path"):
+    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, panda, yumi, or the path"):
         load_robot("peper")
     with pytest.raises(UserError, match="nothing.urdf is not a file"):
         load_robot(str(tmp_path / "nothing.urdf"))

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -23,9 +23,6 @@ from mild_viz.training.sweep_config import Cell, read_sweep_config
 from mild_viz.training.sweep_results import summary
 from mild_viz.training.sweep_workers import Outcome, finished, on_cluster, on_this_machine, run_cell
 from tests.test_sweep_config import PROGRAM, REPOSITORY
-
-if TYPE_CHECKING:
-    from distributed import LocalCluster
 
 QUICK = TrainingOptions(seeds=1, human_epochs=2, robot_epochs=2, em_iterations=2, final_em_iterations=2)
 CONFIG = """
@@ -70,7 +67,9 @@ def models(out: Path) -> dict[str, int]:
     return {file.parent.name: file.stat().st_mtime_ns for file in out.glob("*/config.json")}
 
 
-def test_killed_interrupted_and_started_again_it_redoes_only_what_is_unfinished(tmp_path: Path) -> None:
+def test_killed_interrupted_and_started_again_it_redoes_only_what_is_unfinished(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, out = write(tmp_path, [0, 1, 2], 6), tmp_path / "out"
     program = start(str(file), "--jobs", "2")
     wait_until(lambda: list(out.glob(".*.training/human.pt")), program)
@@ -105,8 +104,9 @@ def test_killed_interrupted_and_started_again_it_redoes_only_what_is_unfinished(
 
     # A narrower config: what still belongs is kept, what does not is named and stays.
     write(tmp_path, [0], 6)
-    status, said = ended(start(str(file)))
-    assert status == 0 and "1 cells, of which 1 are finished" in said
+    assert sweep(file) == 0
+    said = capsys.readouterr().out
+    assert "1 cells, of which 1 are finished" in said
     assert models(out) == after
     strangers = sorted(name for name in after if "seed0" not in name)
     assert f"left as they are: {', '.join(strangers)}" in said
@@ -136,21 +136,20 @@ def test_a_process_that_dies_does_not_stop_the_rest(tmp_path: Path, monkeypatch:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[LocalCluster]:
+def cluster() -> Iterator[Any]:
     from distributed import LocalCluster
 
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
-    ) as cluster:
+    quiet: dict[str, Any] = {"dashboard_address": None, "silence_logs": 50}
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **quiet) as cluster:
         yield cluster
 
 
-def test_a_dask_worker_that_dies_does_not_cost_a_cell(cluster: LocalCluster, tmp_path: Path) -> None:
+def test_a_dask_worker_that_dies_does_not_cost_a_cell(cluster: Any, tmp_path: Path) -> None:
     from distributed import Client
 
     file, out = write(tmp_path, [0, 1, 2, 3], 8), tmp_path / "out"
     with Client(cluster, set_as_default=False) as client:
-        workers = client.run(os.getpid)
+        workers: Any = client.run(os.getpid)
         assert len(set(workers.values()) - {os.getpid()}) == 2
         program = start(str(file), "--scheduler", cluster.scheduler_address)
         wait_until(lambda: len(list(out.glob(".*.training/human.pt"))) == 2, program)
@@ -161,16 +160,16 @@ def test_a_dask_worker_that_dies_does_not_cost_a_cell(cluster: LocalCluster, tmp
         assert len(models(out)) == 4 and "failed" not in said
         assert set(pd.read_csv(out / "results.csv").seed) == {0, 1, 2, 3}
         assert not list(out.glob(".*")) and not list(out.glob("*.error.txt"))
-        assert set(client.run(os.getpid).values()) != set(workers.values())
+        after: Any = client.run(os.getpid)
+        assert set(after.values()) != set(workers.values())
 
 
 def test_a_cell_that_kills_dask_workers_is_reported(
-    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from distributed import Client
 
     monkeypatch.setattr(sweep_workers, "run_cell", run_or_die)
-    assert cluster.scheduler is not None
     monkeypatch.setattr(cluster.scheduler, "allowed_failures", 1)
     with Client(cluster, set_as_default=False) as client:
         outcomes = list(on_cluster([cell(1)], tmp_path, "", client))
@@ -227,11 +226,12 @@ def test_settings_are_ranked_by_held_out_error_never_by_the_test_split() -> None
     nan = float("nan")
 
     def rows(beta: float, held_out: list[float], test: list[float]) -> list[dict[str, Any]]:
+        shared = {"dataset": "demo", "variant": "v3.1", "beta": beta}
         return [
-            {"cell": f"{beta}-{seed}", "dataset": "demo", "variant": "v3.1", "seed": seed, "beta": beta,
-             "action": action, "held_out_mse": held_out[seed], "test_mse": test[seed]}
-            for seed in range(len(held_out)) for action in ("wave", "handshake")
-        ]  # fmt: skip
+            {**shared, "cell": f"{beta}-{seed}", "seed": seed, "action": action, "held_out_mse": one, "test_mse": two}
+            for seed, (one, two) in enumerate(zip(held_out, test, strict=True))
+            for action in ("wave", "handshake")
+        ]
 
     table = summary(
         rows(0.1, [3, 3, 9], [1, 1, 1]) + rows(0.2, [1, 2, nan], [0, 0, 0]) + rows(0.3, [2, 2, 5], [9, 9, 9])

@@ -29,6 +29,7 @@ from mild_viz.training.robot_stage import conditional_factors, train_robot_stage
 from mild_viz.training.run import choose_seed, hold_out, train
 from mild_viz.training.state import RunState
 from mild_viz.training.transition import learn_transition_states
+from tests.disk import full_disk
 from tests.models import ACTIONS, random_checkpoint
 
 JOINTS = ROBOTS["pepper"].joint_names
@@ -256,6 +257,15 @@ def test_a_damaged_state_is_named(tmp_path: Path) -> None:
     (state.folder / "run.json").write_text("[]")
     with pytest.raises(UserError, match=r"run\.json is damaged"):
         RunState(tmp_path / "run", {}, QUICK, resume=True)
+
+
+def test_a_full_disk_leaves_the_last_state(tmp_path: Path) -> None:
+    with RunState(tmp_path / "run", {}, QUICK, resume=False) as state:
+        state.save("human", {"epoch": 1})
+        with full_disk(1000), pytest.raises(UserError, match=r"human\.pt cannot be written"):
+            state.save("human", {"epoch": 2, "net": torch.zeros(1000)})
+        assert state.load("human") == {"epoch": 1}
+        assert sorted(path.name for path in state.folder.iterdir()) == ["human.pt", "lock", "run.json"]
 
 
 def test_a_diverged_seed_is_never_chosen() -> None:

@@ -104,7 +104,7 @@ class Buetepage:
 
     @property
     def variants(self) -> tuple[str, ...]:
-        """As a checkpoint's: the one name under which it is measured."""
+        """What it is called in a table of errors."""
         return (BUETEPAGE,)
 
     def _lstm(self, name: str) -> LSTM:
@@ -135,9 +135,6 @@ class Buetepage:
 
 
 HEAD = ("head.0", "head.1", "z_mean")
-
-Measurable = Checkpoint | Buetepage
-"""What an evaluation can measure."""
 
 
 def predict_windows(model: Buetepage, data: Windows) -> Float[np.ndarray, "R Y"]:
@@ -186,7 +183,7 @@ def is_buetepage(path: Path) -> bool:
     return isinstance(config, dict) and config.get("kind") == BUETEPAGE
 
 
-def load_model(path: Path) -> Measurable:
+def load_model(path: Path) -> Checkpoint | Buetepage:
     """A MILD checkpoint or a baseline, whichever the folder holds."""
     return load_buetepage(path) if is_buetepage(path) else load_checkpoint(path)
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.evaluation import buetepage
 from mild_viz.evaluation.baselines import BASELINES, Examples
-from mild_viz.evaluation.buetepage import Buetepage, Measurable
+from mild_viz.evaluation.buetepage import Buetepage
 from mild_viz.evaluation.paper import paper_rows
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.prediction import predict
@@ -90,7 +91,11 @@ def window_errors(
     return squared.mean(1)
 
 
-def predict_windows(checkpoint: Measurable, variant: str, data: Windows) -> Float[np.ndarray, "R Y"]:
+Model = Checkpoint | Buetepage
+"""What can be measured: a MILD checkpoint, or a baseline that is trained."""
+
+
+def predict_windows(checkpoint: Model, variant: str, data: Windows) -> Float[np.ndarray, "R Y"]:
     """Partner windows that a model predicts from the human's, conditioned on the human-only forward variable."""
     if isinstance(checkpoint, Buetepage):
         return buetepage.predict_windows(checkpoint, data)
@@ -132,7 +137,7 @@ def measure_baselines(dataset: str, train: Windows, test: Windows, human_human: 
     return results
 
 
-def measure_model(dataset: str, checkpoint: Measurable, data: Windows) -> list[Measured]:
+def measure_model(dataset: str, checkpoint: Model, data: Windows) -> list[Measured]:
     """Every variant of a checkpoint on windows of one dataset."""
     for action in dict.fromkeys(data.actions):
         _complete(data, action)
@@ -142,13 +147,13 @@ def measure_model(dataset: str, checkpoint: Measurable, data: Windows) -> list[M
     ]
 
 
-def model_rows(checkpoint: Measurable, trials: Sequence[Trial]) -> list[Row]:
+def model_rows(checkpoint: Model, trials: Sequence[Trial]) -> list[Row]:
     """Every variant of a checkpoint on the given trials of one dataset."""
     data = stack_windows(trials, joint_names(checkpoint))
     return [row for measured in measure_model(trials[0].dataset, checkpoint, data) for row in measured.rows()]
 
 
-def joint_names(checkpoint: Measurable) -> tuple[str, ...] | None:
+def joint_names(checkpoint: Model) -> tuple[str, ...] | None:
     """The joints that a model predicts; None where it predicts the second human."""
     return checkpoint.robot.joint_names if checkpoint.robot else None
 

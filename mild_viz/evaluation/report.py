@@ -16,10 +16,11 @@ import pandas as pd
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.baselines import BASELINES
-from mild_viz.evaluation.buetepage import Measurable, load_model
+from mild_viz.evaluation.buetepage import load_model
 from mild_viz.evaluation.layout import comparison_table, error_table, runs_table
 from mild_viz.evaluation.metrics import (
     Measured,
+    Model,
     Row,
     joint_names,
     measure_baselines,
@@ -43,7 +44,7 @@ class Evaluation:
     """Checkpoints on a dataset's test split, beside baselines and the paper's figures."""
 
     dataset: Dataset
-    checkpoints: dict[str, Measurable]
+    checkpoints: dict[str, Model]
     """By a name that tells them apart."""
     measured: tuple[Measured, ...]
     published: tuple[Row, ...]
@@ -102,7 +103,7 @@ class Evaluation:
         return frame.reindex(columns=columns).astype(dict.fromkeys(("n_windows", "n_trials", "n_runs"), "Int64"))
 
 
-def measure(checkpoints: dict[str, Measurable], dataset: Dataset, pairs: Sequence[str] = ()) -> Evaluation:
+def measure(checkpoints: dict[str, Model], dataset: Dataset, pairs: Sequence[str] = ()) -> Evaluation:
     """Measure named checkpoints on a dataset's test split, and compare predictors.
 
     Args:
@@ -148,7 +149,7 @@ def measure(checkpoints: dict[str, Measurable], dataset: Dataset, pairs: Sequenc
     )
 
 
-def choose_pairs(names: Sequence[str], checkpoints: dict[str, Measurable]) -> list[tuple[str, str]]:
+def choose_pairs(names: Sequence[str], checkpoints: dict[str, Model]) -> list[tuple[str, str]]:
     """The pairs that `measure` compares; an error lists the names that may be given."""
     held = [(variant, name) for name, model in checkpoints.items() for variant in model.variants]
     variants = list(dict.fromkeys(variant for variant, _ in held))
@@ -193,7 +194,7 @@ def evaluate(
     return result
 
 
-def load_named(paths: Sequence[Path]) -> dict[str, Measurable]:
+def load_named(paths: Sequence[Path]) -> dict[str, Model]:
     """Load checkpoints, each once, by the folder's name, or by the whole path where two have the same name."""
     paths = list({path.resolve(): path for path in paths}.values())
     names = [path.resolve().name for path in paths]

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mild_viz.checkpoint import CONFIG
+from mild_viz.checkpoint import CONFIG, Checkpoint
 from mild_viz.errors import UserError
-from mild_viz.evaluation.buetepage import Measurable
+from mild_viz.evaluation.buetepage import Buetepage
 from mild_viz.evaluation.metrics import Measured
 
 CHECKPOINTS = "checkpoints"
@@ -81,7 +81,7 @@ def over_checkpoints(measured: Sequence[Measured]) -> list[OverRuns]:
     return result
 
 
-def over_recorded_seeds(name: str, checkpoint: Measurable, dataset: str) -> list[OverRuns]:
+def over_recorded_seeds(name: str, checkpoint: Checkpoint | Buetepage, dataset: str) -> list[OverRuns]:
     """Best and median over the seeds of a training run, as its checkpoint's metrics["test_seeds"] records them.
 
     That is a list over seeds of rows as metrics["test"] has them. Empty where it is absent or of another dataset.

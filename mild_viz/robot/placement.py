@@ -147,7 +147,8 @@ def recorded_placement(chain: ArmChain, trial: Trial) -> PlacedHuman | None:
         translation = chain.shoulder + shrink * stands @ apart - human_rotation @ shoulder
     if not np.isfinite(translation).all():
         return None
-    source = "recorded: the robot takes the partner's place, nearer as its arm is shorter"
+    nearer = "nearer as its arm is shorter" if chain.reach < arm_length(partner) else "farther as its arm is longer"
+    source = f"recorded: the robot takes the partner's place, {nearer}"
     placement = _placement(chain, translation, source, estimated=False)
     return PlacedHuman(T_world_human(chain, placement, human_rotation), placement)
 

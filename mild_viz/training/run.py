@@ -82,6 +82,12 @@ class Plan:
         return tuple(name for name in self.variants if not VARIANTS[name].own_models)
 
 
+def robot_interface(dataset: str) -> RobotInterface:
+    """The robot that models of a dataset drive: the recorded one, or the one that its second human is retargeted to."""
+    name = robot_of(dataset)
+    return RobotInterface(name, ROBOTS[name].joint_names, ROBOTS[name].end_effector)
+
+
 def plan_run(
     dataset: str, stage: str, variants: Sequence[str], options: TrainingOptions, init: Path | None = None
 ) -> Plan:
@@ -105,8 +111,7 @@ def plan_run(
         raise UserError(f"dataset '{dataset}' has no second human; valid for it: --stage hri")
     robot = None
     if stage == "hri":
-        name = robot_of(dataset)
-        robot = RobotInterface(name, ROBOTS[name].joint_names, ROBOTS[name].end_effector)
+        robot = robot_interface(dataset)
     else:  # a human-human model is v1 by construction: its one VAE serves both, and no robot VAE is trained
         variants = tuple(name for name in variants if VARIANTS[name].own_models or name == "v1") or ("v1",)
     start = None if init is None else load_checkpoint(init)

@@ -100,7 +100,14 @@ class RunState:
 
     def save(self, stage: str, content: dict[str, Any]) -> None:
         """Replace a stage's state, atomically."""
-        write_atomically(self.folder / f"{stage}.pt", lambda temporary: torch.save(content, temporary))
+
+        def write(temporary: Path) -> None:
+            try:
+                torch.save(content, temporary)
+            except RuntimeError as error:  # what torch makes of a full disk
+                raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None
+
+        write_atomically(self.folder / f"{stage}.pt", write)
 
     def release(self) -> None:
         """Let another run have the folder; what was saved stays."""

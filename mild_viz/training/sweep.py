@@ -93,9 +93,9 @@ def _error_file(cell: Cell, out: Path) -> Path:
 
 def _tell_strangers(cells: Sequence[Cell], out: Path, file: Path) -> None:
     """Name the folders of cells that the config no longer has; they stay."""
-    names = {cell.name for cell in cells}
-    strangers = sorted(path.name for path in out.iterdir() if path.is_dir() and path.name not in names)
-    strangers = [name for name in strangers if not name.startswith(".")]
+    ours = {path.name for cell in cells for path in (out / cell.name, state_folder(out / cell.name))}
+    folders = sorted(path.name for path in out.iterdir() if path.is_dir() and path.name not in ours)
+    strangers = [name for name in folders if not name.startswith(".") or name.endswith(".training")]
     if strangers:
         _say(f"{out}: not of {file}, and left as they are: {', '.join(strangers)}")
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from modelling.description import ZERO, Joint, Y, Z
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, WHITE
-from modelling.surfaces import Y_AXIS, Colour, Loft, Piece, band, body, lathe, limb, rim, slab
+from modelling.round import band, lathe, limb
+from modelling.surfaces import Y_AXIS, Colour, Loft, Piece, body, rim, slab
 
 ROOT = "world"
 SHARED: dict[str, str] = {}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from modelling.palette import DARK, GREY, LIGHT, WHITE
-from modelling.surfaces import X_AXIS, Y_AXIS, Array, Colour, Loft, Piece, body, ellipsoid, revolve, shell, spline, tube
+from modelling.round import revolve, tube
+from modelling.surfaces import X_AXIS, Y_AXIS, Array, Colour, Loft, Piece, body, ellipsoid, shell, spline
 
 HAND_OPENING = 0.7
 """The value of the hand joint for which the fingers are drawn: relaxed, ready to be shaken."""

@@ -10,20 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, SCREEN, WHITE
-from modelling.surfaces import (
-    Y_AXIS,
-    Array,
-    Colour,
-    LobedLoft,
-    Loft,
-    Piece,
-    body,
-    disc_decal,
-    ellipsoid,
-    revolve,
-    shell,
-    slab,
-)
+from modelling.round import revolve
+from modelling.surfaces import Y_AXIS, Array, Colour, LobedLoft, Loft, Piece, body, disc_decal, ellipsoid, shell, slab
 from scipy.interpolate import PchipInterpolator
 
 PI = np.pi

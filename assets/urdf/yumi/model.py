@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from modelling.description import ZERO, Joint, Z
 from modelling.palette import BLACK, DARK, GREY, LED, LIGHT, WHITE
-from modelling.surfaces import Y_AXIS, Array, Loft, Piece, band, body, lathe, limb, rim, slab, tube
+from modelling.round import band, lathe, limb, tube
+from modelling.surfaces import Y_AXIS, Array, Loft, Piece, body, rim, slab
 
 ROOT = "yumi_base_link"
 

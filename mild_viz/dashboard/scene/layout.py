@@ -81,7 +81,6 @@ class Layout:
 
 
 def make_layout(
-    T_world_human: Float[np.ndarray, "4 4"],
     robot_top: Vector,
     human_top: Vector,
     human_eye: Vector,
@@ -89,7 +88,7 @@ def make_layout(
     floor: float,
 ) -> Layout:
     """The layout of a dyad: the plot stands beyond the human, a little turned towards the dyad's viewer."""
-    away = T_world_human[:3, 3] * [1.0, 1.0, 0.0]
+    away = human_top * [1.0, 1.0, 0.0]  # not where the human's frame is: one who walks leaves it behind
     distance = float(np.linalg.norm(away))
     forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
     centre = forward * (max(distance, 0.75) + 1.40)

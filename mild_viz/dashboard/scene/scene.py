@@ -167,4 +167,4 @@ def scene_layout(rollout: Rollout, figure: Figure, bounds: Float[np.ndarray, "2 
     distance = np.where(np.isfinite(rollout.hand_distance), rollout.hand_distance, np.inf)
     hand = np.nan_to_num(rollout.target[int(distance.argmin())])
     robot_top = np.array([0.0, 0.0, bounds[1, 2]])
-    return make_layout(T, robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet))
+    return make_layout(robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet))

@@ -91,19 +91,28 @@ class HSMM(HMM):
         `transitions[j, i]` counts segments of i after one of j. `durations[i, d]` counts segments of i of d + 1 steps;
         the last segment, which is cut off, counts with the durations that it may come to have.
         """
-        reach = min(len(log_likelihood), self.log_durations.shape[1])  # no segment is older than the sequence
-        transition, stay, leave = self.chain
-        chain = (transition, np.ascontiguousarray(stay[:, :reach]), np.ascontiguousarray(leave[:, :reach]))
         log_likelihood = np.ascontiguousarray(log_likelihood)
+        reach = min(len(log_likelihood), self.log_durations.shape[1])  # no segment is older than the sequence
+        start, stay, leave = (np.ascontiguousarray(table[:, :reach]) for table in (self.beginning(), *self.chain[1:]))
+        chain = (self.log_transition, stay, leave)
         tables = np.empty((len(log_likelihood), self.n_states, reach))
-        log_alpha, log_gamma = np.empty(log_likelihood.shape), np.empty(log_likelihood.shape)
-        beginning = np.ascontiguousarray(self.beginning()[:, :reach])
-        total = kernels.forward(beginning, *chain, log_likelihood, tables, log_alpha)
-        kernels.backward(tables, *chain, log_likelihood, log_gamma, transitions, durations)
+        gamma, changes, ended = np.empty(log_likelihood.shape), np.zeros(transitions.shape), np.zeros(durations.shape)
+        initial, transition = self.initial_probs.copy(), self.transition_matrix.copy()  # which are read-only
+        total = kernels.count_scaled(
+            initial, transition, np.exp(stay), np.exp(leave), log_likelihood, tables, gamma, changes, ended
+        )
+        if np.isnan(total):
+            changes[:], ended[:] = 0.0, 0.0
+            total = kernels.forward(start, *chain, log_likelihood, tables, np.empty(gamma.shape))
+            kernels.backward(tables, *chain, log_likelihood, gamma, changes, ended)
+            log_gamma, log_last = gamma, tables[-1]
+        else:
+            log_gamma, log_last = safe_log(gamma), safe_log(tables[-1])
         # p(D = d given that it lasts e steps or more) p(e), summed over all e up to d.
-        cut = np.full(self.log_durations.shape, -np.inf)
-        np.subtract(tables[-1], self.log_survival[:, :reach], out=cut[:, :reach], where=np.isfinite(tables[-1]))
-        durations += np.exp(self.log_durations + np.logaddexp.accumulate(cut, axis=1))
+        cut = np.full(durations.shape, -np.inf)
+        np.subtract(log_last, self.log_survival[:, :reach], out=cut[:, :reach], where=np.isfinite(log_last))
+        transitions += changes
+        durations += ended + np.exp(self.log_durations + np.logaddexp.accumulate(cut, axis=1))
         return log_gamma, float(total)
 
     def viterbi(self, log_likelihood: Float[np.ndarray, "N S"]) -> tuple[Int[np.ndarray, " N"], float]:
