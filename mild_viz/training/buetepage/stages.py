@@ -1,7 +1,12 @@
 """The four stages: human VAE, human dynamics, robot VAE, robot dynamics. All seeds train together.
 
-Losses are weighed as the paper's authors do in their implementation: means over dimensions (in units of the
-recording) in all stages but the last, sums there.
+Losses are weighed as the paper's authors do in their implementation (github.com/souljaboy764/buetepage-phri): means
+over dimensions (in units of the recording) in all stages but the last, sums there. Where ours departs from it:
+- Both LSTMs read the frame before the window that they predict. Theirs read its first frame, also the robot's while
+  training, and so a frame later than the one that they get when they run on their own predictions.
+- The robot starts from the rest pose; theirs starts from the true first frame.
+- Inputs are standardised; posteriors are diagonal; where no second human was recorded (HRI-Yumi), the human dynamics
+  train on the one human alone, theirs come from another data set.
 """
 
 from __future__ import annotations
