@@ -17,7 +17,7 @@ from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
-from mild_viz.pairs import robot_truth
+from mild_viz.pairs import check_rate, robot_truth
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
@@ -38,6 +38,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         UserError: if the checkpoint does not know the variant or the action, or the trial is too short.
     """
     interface = checkpoint.for_robot()
+    check_rate(checkpoint.rate, f"checkpoint {checkpoint.name}", [trial])
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
         raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")

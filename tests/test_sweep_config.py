@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import signal
 import subprocess
 import sys
@@ -58,7 +59,7 @@ def test_a_cell_keeps_its_name_however_the_config_says_it(tmp_path: Path) -> Non
     for text in ("[options]\nbeta = 1e-3", "[grid]\nbeta = [1e-3]\nlatent_size = [5]", "[grid]\nbeta = [0.001]"):
         names |= {cell.name for cell in read_sweep_config(write(tmp_path, f'datasets = ["demo"]\n{text}')).cells()}
     (name,) = names
-    assert name.startswith("demo-v1+v2.1+v2.2+v3.1+v3.2-seed0-beta0.001-")
+    assert name.startswith("demo-v1+v2.1+v2.2+v3.1+v3.2+v4-seed0-beta0.001-")
 
 
 def test_everything_that_decides_a_run_decides_its_name() -> None:
@@ -67,7 +68,8 @@ def test_everything_that_decides_a_run_decides_its_name() -> None:
     others += [dataclasses.replace(plain, variants=("v3.1", "v1"))]
     for field in dataclasses.fields(TrainingOptions):
         value = getattr(plain.options, field.name)
-        changed = (9, 7) if isinstance(value, tuple) else value + 1
+        others_of = {str: {"hmm": "hsmm", "cpu": "cuda"}.get, bool: lambda flag: not flag, tuple: lambda _: (9, 7)}
+        changed = others_of.get(type(value), lambda number: number + 1)(value)
         others.append(dataclasses.replace(plain, options=dataclasses.replace(plain.options, **{field.name: changed})))
     names = {cell.name for cell in (plain, *others)}
     assert len(names) == 1 + len(others)
@@ -128,7 +130,7 @@ def test_a_wrong_sweep_is_refused(text: str, expected: str, tmp_path: Path, caps
         ('dataset = "demo"\nseeds = 0', "seeds is 0; valid: 1 to 256"),
         (
             'dataset = "demo"\nepochs = 2\nrobot_epochs = 3',
-            "epochs stands for both stages; leave out robot_epochs, or epochs",
+            "epochs stands for all stages; leave out robot_epochs, or epochs",
         ),
     ],
 )
@@ -142,12 +144,12 @@ def test_a_wrong_training_config_is_refused(text: str, expected: str, tmp_path: 
 def test_a_training_config_may_set_every_option(tmp_path: Path) -> None:
     values: dict[str, Any] = dataclasses.asdict(TrainingOptions(seed=3, beta=0.5, hidden=(12, 6)))
     assert values.keys() == OPTIONS.keys()
-    text = "".join(f"{key} = {list(v) if isinstance(v, tuple) else v!r}\n" for key, v in values.items())
+    text = "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())  # which is TOML, too
     read = read_train_config(write(tmp_path, f'dataset = "nuisi"\nvariants = ["v1"]\nout = "runs/x"\n{text}'))
     assert read.pop("options") == TrainingOptions(**values)
     assert read == {"dataset": "nuisi", "variants": ("v1",), "out": Path("runs/x")}
     brief = read_train_config(write(tmp_path, 'dataset = "demo"\nepochs = 7'))
-    assert brief == {"dataset": "demo", "options": TrainingOptions(human_epochs=7, robot_epochs=7)}
+    assert brief == {"dataset": "demo", "options": TrainingOptions(human_epochs=7, robot_epochs=7, joint_epochs=7)}
     read_train_config(REPOSITORY / "configs" / "train-example.toml")
 
 

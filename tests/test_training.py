@@ -14,6 +14,7 @@ import torch
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
+from mild_viz.evaluation.metrics import model_rows
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
@@ -22,11 +23,13 @@ from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS
 from mild_viz.settings import PAPER_VARIANTS, VARIANTS
 from mild_viz.training import run as training_run
-from mild_viz.training.human_stage import HumanModel, complete_rows, prior_states, train_human_stage
+from mild_viz.training.human_stage import HumanModel, train_human_stage
 from mild_viz.training.networks import BatchedVAE, gaussian_kl, standard_kl
 from mild_viz.training.options import TrainingOptions
+from mild_viz.training.outcome import choose_seed, mean_errors
+from mild_viz.training.priors import complete_rows, prior_states
 from mild_viz.training.robot_stage import conditional_factors, train_robot_stage
-from mild_viz.training.run import choose_seed, hold_out, train
+from mild_viz.training.run import hold_out, train
 from mild_viz.training.state import RunState
 from mild_viz.training.transition import learn_transition_states
 from tests.disk import full_disk
@@ -34,6 +37,12 @@ from tests.models import ACTIONS, random_checkpoint
 
 JOINTS = ROBOTS["pepper"].joint_names
 QUICK = TrainingOptions(seeds=2, human_epochs=3, robot_epochs=3, final_em_iterations=5)
+
+
+def quick(seeds: int, epochs: int, **others: Any) -> TrainingOptions:
+    return TrainingOptions(
+        seeds=seeds, human_epochs=epochs, robot_epochs=epochs, joint_epochs=epochs, members=2, **others
+    )
 
 
 def silent(*_: Any) -> None:
@@ -196,7 +205,8 @@ def test_held_out_trials_are_the_last_of_every_action() -> None:
 def test_the_seed_is_chosen_by_held_out_error() -> None:
     held = hold_out(load_dataset("demo").train, 1)[1]
     candidates = [random_checkpoint(seed) for seed in range(3)]
-    best, scores = choose_seed(candidates, held)
+    scores = [mean_errors(model_rows(candidate, held)) for candidate in candidates]
+    best = choose_seed(scores)
     means = [np.mean([score[v] for v in PAPER_VARIANTS if v != "v1"]) for score in scores]
     assert best == int(np.argmin(means)) and len(scores) == 3
 
@@ -208,7 +218,7 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
     small = replace(whole, train=tuple(few), test=whole.test[::4])
     monkeypatch.setattr(training_run, "load_dataset", lambda _: small)
     out = tmp_path / "runs" / "model"
-    made = train("demo", "hri", ("v3.1", "v1"), seeds=2, epochs=2, out=out)
+    made = train("demo", "hri", ("v3.1", "v1"), quick(2, 2), out, command="a command")
     assert made.variants == ("v3.1", "v1") and made.placement is not None and made.placement.estimated
     assert set(made.contact_states) == set(ACTIONS)
     assert made.contact_states["wave"] == frozenset() and made.contact_states["handshake"]
@@ -221,17 +231,17 @@ def test_the_command_writes_a_checkpoint_and_never_chooses_by_the_test_split(
             made.transition_states[action].mean, state.mean, atol=1e-4
         )  # saved weights are rounded
     config = json.loads((out / "config.json").read_text())
-    assert config["training"]["command"].startswith("mild-viz train --dataset demo --stage hri --variant v3.1 v1")
+    assert config["training"]["command"] == "a command" and config["rate"] == 30.0
     assert config["dataset"] == {"name": "demo", "checksum": whole.checksum}
     assert len(config["metrics"]["held_out"]) == 2
     assert [p.name for p in out.parent.iterdir()] == ["model"]
 
     shuffled = replace(small, test=tuple(reversed(whole.test[1::4])))
     monkeypatch.setattr(training_run, "load_dataset", lambda _: shuffled)
-    again = train("demo", "hri", ("v3.1", "v1"), seeds=2, epochs=2, out=tmp_path / "again")
+    again = train("demo", "hri", ("v3.1", "v1"), quick(2, 2), tmp_path / "again")
     assert (again.path / "weights.safetensors").read_bytes() == (out / "weights.safetensors").read_bytes()
 
-    human = train("demo", "hhi", seeds=1, epochs=1, out=tmp_path / "human")
+    human = train("demo", "hhi", ("v1",), quick(1, 1), tmp_path / "human")
     assert human.robot is None and load_checkpoint(human.path).variants == ("v1",)
 
 
@@ -241,7 +251,7 @@ def test_wrong_options_are_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="variant 'v7' is unknown"):
         train("demo", variants=("v7",), out=tmp_path / "x")
     with pytest.raises(UserError, match="seeds is 0; valid: 1 to 256"):
-        train("demo", seeds=0, out=tmp_path / "x")
+        train("demo", options=TrainingOptions(seeds=0), out=tmp_path / "x")
     (tmp_path / "notes.txt").write_text("precious")
     with pytest.raises(UserError, match="notes"):
         train("demo", out=tmp_path)
@@ -273,20 +283,21 @@ def test_a_diverged_seed_is_never_chosen() -> None:
     good = random_checkpoint(0)
     weights = {name: np.full_like(value, np.nan) for name, value in good.members("v3.1")[0].robot_vae.weights.items()}
     broken = replace(good, robot_vaes={**good.robot_vaes, "v3.1": VAE(weights)})
-    assert choose_seed([broken, good], held)[0] == 1
+    bad, fine = (mean_errors(model_rows(candidate, held)) for candidate in (broken, good))
+    assert choose_seed([bad, fine]) == 1
     with pytest.raises(UserError, match="every seed diverged"):
-        choose_seed([broken, broken], held)
+        choose_seed([bad, bad])
 
 
 def test_recordings_without_contact_or_without_any_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = load_dataset("demo")
     waves = replace(whole, train=tuple(t for t in whole.train if t.action == "wave")[:3], test=whole.test)
     monkeypatch.setattr(training_run, "load_dataset", lambda _: waves)
-    made = train("demo", "hri", ("v3.1",), seeds=1, epochs=1, out=tmp_path / "waves")
+    made = train("demo", "hri", ("v3.1",), quick(1, 1), tmp_path / "waves")
     assert made.placement is None and made.actions == ("wave",)
 
     unseen = [replace(t, human_arm=np.full_like(t.human_arm, np.nan)) for t in waves.train]
     monkeypatch.setattr(training_run, "load_dataset", lambda _: replace(waves, train=tuple(unseen)))
     with pytest.raises(UserError, match="action 'wave' has no complete window"):
-        train("demo", "hri", ("v3.1",), seeds=1, epochs=1, out=tmp_path / "unseen")
+        train("demo", "hri", ("v3.1",), quick(1, 1), tmp_path / "unseen")
     assert [p.name for p in tmp_path.iterdir()] == ["waves"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_format
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -44,7 +44,7 @@ class Evaluation:
     """Checkpoints on a dataset's test split, beside baselines and the paper's figures."""
 
     dataset: Dataset
-    checkpoints: dict[str, Model]
+    checkpoints: Mapping[str, Model]
     """By a name that tells them apart."""
     measured: tuple[Measured, ...]
     published: tuple[Row, ...]
@@ -103,7 +103,7 @@ class Evaluation:
         return frame.reindex(columns=columns).astype(dict.fromkeys(("n_windows", "n_trials", "n_runs"), "Int64"))
 
 
-def measure(checkpoints: dict[str, Model], dataset: Dataset, pairs: Sequence[str] = ()) -> Evaluation:
+def measure(checkpoints: Mapping[str, Model], dataset: Dataset, pairs: Sequence[str] = ()) -> Evaluation:
     """Measure named checkpoints on a dataset's test split, and compare predictors.
 
     Args:
@@ -149,7 +149,7 @@ def measure(checkpoints: dict[str, Model], dataset: Dataset, pairs: Sequence[str
     )
 
 
-def choose_pairs(names: Sequence[str], checkpoints: dict[str, Model]) -> list[tuple[str, str]]:
+def choose_pairs(names: Sequence[str], checkpoints: Mapping[str, Model]) -> list[tuple[str, str]]:
     """The pairs that `measure` compares; an error lists the names that may be given."""
     held = [(variant, name) for name, model in checkpoints.items() for variant in model.variants]
     variants = list(dict.fromkeys(variant for variant, _ in held))

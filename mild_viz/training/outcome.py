@@ -49,6 +49,11 @@ def mean_error(rows: Sequence[Row], variant: str) -> float:
     return float(np.mean([row.mse_mean for row in rows if row.model == variant]))
 
 
+def mean_errors(rows: Sequence[Row]) -> dict[str, float]:
+    """Every variant's error, averaged over actions."""
+    return {model: mean_error(rows, model) for model in dict.fromkeys(row.model for row in rows)}
+
+
 def choose_seed(scores: Sequence[Mapping[str, float]]) -> int:
     """The candidate with the lowest error on held-out trials; the first where nothing was held out.
 
@@ -67,7 +72,7 @@ def choose_seed(scores: Sequence[Mapping[str, float]]) -> int:
 def save_best(candidates: Sequence[Candidate], plan: Plan, made: Made, out: Path) -> Checkpoint:
     """Choose among the candidates on held-out trials, measure, learn what contact is, and write the folder."""
     held = [_held_out_rows(candidate.checkpoint, plan) for candidate in candidates] if plan.held else []
-    scores = [{model: mean_error(rows, model) for model in dict.fromkeys(row.model for row in rows)} for rows in held]
+    scores = [mean_errors(rows) for rows in held]
     best = choose_seed(scores)
     chosen = candidates[best].checkpoint
     training = {

@@ -23,8 +23,8 @@ from mild_viz.training.human_stage import HumanModel, train_human_stage
 from mild_viz.training.joint_stage import train_joint_stage
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.outcome import Candidate, Made, save_best
-from mild_viz.training.priors import complete_rows
 from mild_viz.training.progress import HeldOut, shown
+from mild_viz.training.recordings import training_windows
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
 from mild_viz.trial import Dataset, Trial
@@ -60,6 +60,12 @@ class Plan:
     fit: list[Trial]
     held: list[Trial]
     init: Checkpoint | None
+    paired: Windows
+    """Human windows with the partner's, of the trials to fit."""
+    human: Windows
+    """What the human stage learns from: windows of two humans where there are two, else the same."""
+    joint: Windows
+    """What v4 learns from: held-out trials, too, unless they are to be kept from it."""
 
     @property
     def rate(self) -> float:
@@ -121,7 +127,13 @@ def plan_run(
             if found != getattr(options, name):
                 raise UserError(f"{init}: {name} is {found}, this run has {getattr(options, name)}; they must be equal")
     fit, held = hold_out(source.train, options.held_out, options.fold)
-    return Plan(source, stage, variants, options, robot, fit, held, start)
+    joints = None if robot is None else robot.joint_names
+    paired = human = joint = training_windows(fit, joints)
+    if robot is not None and source.train[0].partner_arm is not None:
+        human = training_windows(fit, None)
+    if held and any(VARIANTS[name].own_models for name in variants) and not options.joint_held_out:
+        joint = training_windows(source.train, joints)
+    return Plan(source, stage, variants, options, robot, fit, held, start, paired, human, joint)
 
 
 def train(
@@ -169,36 +181,15 @@ def train(
         raise
 
 
-def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
-    """The training windows; an error says which action has none that is complete, before anything is trained."""
-    data = stack_windows(trials, joint_names)
-    whole = set(complete_rows(data).trial.tolist())
-    for action in dict.fromkeys(data.actions):
-        if not any(of == action and trial in whole for trial, of in enumerate(data.actions)):
-            raise UserError(f"action '{action}' has no complete window in the training trials; check the recordings")
-    still = float(complete_rows(data).partner.std(0).max())
-    if still < 1e-9:
-        raise UserError(
-            f"dataset '{trials[0].dataset}': the partner never moves in the training trials (all of "
-            f"{', '.join(joint_names or ['the arm'])} are constant); expected motion to learn"
-        )
-    return data
-
-
 def _train_stages(plan: Plan, state: RunState, out: Path, quiet: bool, tensorboard: Path | None) -> list[Candidate]:
     """All stages of a plan with a progress bar each. Returns one candidate a seed."""
-    options, joints = plan.options, plan.joints
-    human_human = plan.robot is None
-    paired = training_windows(plan.fit, joints)
-    human_data = paired if plan.recorded_robot or human_human else training_windows(plan.fit, None)
+    options, human_human = plan.options, plan.robot is None
     own = [name for name in plan.variants if VARIANTS[name].own_models]
-    joint_data = paired
-    if own and not options.joint_held_out:
-        joint_data = training_windows(plan.source.train, joints)
     held = held_human = None
     if plan.held:
-        held = HeldOut(stack_windows(plan.held, joints), human_human, plan.rate)
-        held_human = held if human_data is paired else HeldOut(stack_windows(plan.held, None), True, plan.rate)
+        held = HeldOut(stack_windows(plan.held, plan.joints), human_human, plan.rate)
+        shared = plan.human is plan.paired
+        held_human = held if shared else HeldOut(stack_windows(plan.held, None), True, plan.rate)
     stages = {"human": options.human_epochs}
     if plan.robot is not None and plan.shared_variants:
         stages["robot"] = options.robot_epochs
@@ -210,17 +201,17 @@ def _train_stages(plan: Plan, state: RunState, out: Path, quiet: bool, tensorboa
     try:
         with shown(stages, quiet, tensorboard) as progress:
             humans = train_human_stage(
-                human_data, options, progress, state, not plan.recorded_robot, plan.init, held_human
+                plan.human, options, progress, state, not plan.recorded_robot, plan.init, held_human
             )
             robots: list[dict[str, VAE]] = [{} for _ in humans]
             if "robot" in stages:
                 robots = train_robot_stage(
-                    paired, humans, plan.shared_variants, options, progress, state, plan.init, held
+                    plan.paired, humans, plan.shared_variants, options, progress, state, plan.init, held
                 )
             joint: list[list[InteractionModel]] = [[] for _ in humans]
             if own:
                 watched = held if options.joint_held_out else None
-                joint = train_joint_stage(joint_data, plan.rate, options, progress, state, plan.init, watched)
+                joint = train_joint_stage(plan.joint, plan.rate, options, progress, state, plan.init, watched)
     finally:
         torch.set_num_threads(threads)
     return [

@@ -27,7 +27,8 @@ from mild_viz.training.buetepage.stages import (
 from mild_viz.training.options import TrainingOptions
 from mild_viz.training.outcome import mean_error
 from mild_viz.training.progress import Progress, shown
-from mild_viz.training.run import plan_run, training_windows
+from mild_viz.training.recordings import training_windows
+from mild_viz.training.run import plan_run
 from mild_viz.trial import Dataset, Trial
 
 HUMAN_STAGES = ("human VAE", "human dynamics")
