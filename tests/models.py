@@ -74,7 +74,7 @@ def random_hsmm(rng: np.random.Generator, n_states: int, size: int, longest: flo
     )
 
 
-LAYOUT = ContextLayout(lags=(3, 7), clock=True)
+LAYOUT = ContextLayout(lags=(3, 7), clock=2.0)
 
 
 def random_own_model(rng: np.random.Generator, robot_size: int = 20) -> InteractionModel:

@@ -77,7 +77,7 @@ def test_a_failing_swap_brings_the_old_folder_back(
             raise error
         move(source, target)
 
-    monkeypatch.setattr("mild_viz.checkpoint.folder.os.replace", replace_until)
+    monkeypatch.setattr("mild_viz.files.os.replace", replace_until)
     with pytest.raises((UserError, KeyboardInterrupt)):
         save_checkpoint(random_checkpoint(1), folder, "")
     assert content(folder) == before
@@ -381,9 +381,9 @@ def edited(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     [
         (lambda c: c["own_models"].pop("v4"), r"own_models is about nothing, expected v4"),
         (lambda c: c["own_models"]["v4"].update(n_models=3), r"v4/2/human: tensor 'encoder.0.weight' is missing"),
-        (lambda c: c["own_models"]["v4"].update(lags=[3]), r"regression/wave/gain' has shape \(6, 5, 17\), expected"),
+        (lambda c: c["own_models"]["v4"].update(lags=[3]), r"regression/wave/gain' has shape \(6, 5, 31\), expected"),
         (lambda c: c["own_models"]["v4"].update(lags=[0]), r"v4.lags is 0, expected a whole number"),
-        (lambda c: c["own_models"]["v4"].update(clock=1), r"v4.clock is 1, expected true or false"),
+        (lambda c: c["own_models"]["v4"].update(clock=-1), r"clock is -1.0; valid: a number from 0 to 100"),
         (lambda c: c.update(rate=0), r"rate is 0.0, expected frames a second"),
         (lambda c: c.update(own_contact_states={"v3.1": {}}), r"own_contact_states 'v3.1' is unknown; valid: v4"),
     ],

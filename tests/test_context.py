@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mild_viz.errors import UserError
-from mild_viz.latent.context import CLOCKS, ContextLayout, condition_on_context, fit_regression
+from mild_viz.latent.context import CLOCK_SPAN, ContextLayout, condition_on_context, fit_regression
 from mild_viz.latent.gmr import condition
 from mild_viz.prediction import advance, predict
 from tests.models import LAYOUT, random_checkpoint, random_hmm
@@ -14,15 +14,23 @@ from tests.models import LAYOUT, random_checkpoint, random_hmm
 
 def test_a_context_holds_the_past_latents_and_the_clock() -> None:
     z = np.arange(12.0).reshape(6, 2)
-    layout = ContextLayout(lags=(2,), clock=True)
+    layout = ContextLayout(lags=(2,), clock=3.0)
     contexts = layout.contexts(z, np.empty((0, 2)), 0, rate=2.0)
-    assert contexts.shape == (6, layout.size(2)) == (6, 6)
+    assert contexts.shape == (6, layout.size(2)) == (6, 4 + 16)
     np.testing.assert_array_equal(contexts[:, :2], z)
     np.testing.assert_array_equal(contexts[:, 2:4], z[[0, 0, 0, 1, 2, 3]])  # the first one stands in at the beginning
-    for column, limit in enumerate(CLOCKS):
-        np.testing.assert_allclose(contexts[:, 4 + column], 2 * np.minimum(np.arange(6) / 2.0 / limit, 1) - 1)
+    for bump in range(16):  # one a second
+        expected = 3.0 * np.exp(-0.5 * (np.arange(6) / 2.0 - bump) ** 2)
+        np.testing.assert_allclose(contexts[:, 4 + bump], expected)
+    late = layout.times(np.array([2 * CLOCK_SPAN, 1000.0]), rate=2.0)
+    np.testing.assert_array_equal(late[0], late[1])  # it stands still
     continued = layout.contexts(z[4:], z[2:4], 4, rate=2.0)
     np.testing.assert_array_equal(continued, contexts[4:])
+
+
+def test_an_impossible_clock_is_refused() -> None:
+    with pytest.raises(UserError, match="clock is -1.0; valid: a number from 0 to 100"):
+        ContextLayout(clock=-1.0)
 
 
 @pytest.mark.parametrize("lags", [(0,), (-3,), (2000,)])

@@ -189,7 +189,7 @@ def _own_models(value: Any, variants: Sequence[str], where: str) -> dict[str, Ow
         _need(_typed(row, dict, f"{where}.{name}"), ("n_models", "lags", "clock"), f"{where}.{name}")
         lags = tuple(_size(lag, f"{where}.{name}.lags") for lag in _typed(row["lags"], list, f"{where}.{name}.lags"))
         try:
-            layout = ContextLayout(lags, _typed(row["clock"], bool, f"{where}.{name}.clock"))
+            layout = ContextLayout(lags, _number(row["clock"], f"{where}.{name}.clock"))
         except UserError as error:
             raise UserError(f"{where}.{name}: {error}") from None
         result[name] = OwnModels(_size(row["n_models"], f"{where}.{name}.n_models"), layout)

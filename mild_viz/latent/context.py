@@ -18,14 +18,24 @@ from mild_viz.latent.gmr import mix_states
 from mild_viz.latent.hmm import observed_rows
 from mild_viz.trial import freeze_arrays
 
-CLOCKS = (1.0, 10.0)
-"""Times after which a clock of the context stands still [s]: one tells the onset, the other the length of a trial."""
+CLOCK_STEP = 1.0
+"""Distance and width of the bumps that tell the time [s]: as exact as people are on time."""
+
+CLOCK_SPAN = 15.0
+"""Time after which the clock stands still [s]: trials are not longer."""
 
 MAX_LAG = 1000
 """Longest lag [frames]."""
 
+MAX_CLOCK = 100.0
+"""Largest height of the clock's bumps."""
+
 RESIDUAL_FLOOR = 1e-4
 """Added to the diagonal of every conditional covariance [latent units squared]."""
+
+
+def _bumps() -> Float[np.ndarray, " K"]:
+    return np.arange(int(CLOCK_SPAN / CLOCK_STEP) + 1.0)
 
 
 @dataclass(frozen=True)
@@ -34,12 +44,14 @@ class ContextLayout:
 
     lags: tuple[int, ...] = ()
     """How many frames ago the further latents are taken."""
-    clock: bool = False
-    """Whether the time since the trial began is in it."""
+    clock: float = 0.0
+    """Height of the bumps that tell the time since the trial began; 0: it is not in the context."""
 
     def __post_init__(self) -> None:
         if any(type(lag) is not int or not 1 <= lag <= MAX_LAG for lag in self.lags):
             raise UserError(f"lags are {self.lags}; valid: whole numbers of frames from 1 to {MAX_LAG}")
+        if not 0.0 <= self.clock <= MAX_CLOCK:
+            raise UserError(f"clock is {self.clock}; valid: a number from 0 to {MAX_CLOCK:g}")
 
     @property
     def n_history(self) -> int:
@@ -48,13 +60,17 @@ class ContextLayout:
 
     def size(self, latent_size: int) -> int:
         """Length C of a context vector."""
-        return latent_size * (1 + len(self.lags)) + (len(CLOCKS) if self.clock else 0)
+        return latent_size * (1 + len(self.lags)) + (len(_bumps()) if self.clock else 0)
 
     def times(self, steps: Float[np.ndarray, " N"], rate: float) -> Float[np.ndarray, "N K"]:
-        """The clocks at steps after the beginning: t / T up to T, shifted to [-1, 1]; K = 0 without a clock."""
+        """Bumps exp(-(t/step - k)^2 / 2) over the time since the beginning, K of them; K = 0 without a clock.
+
+        With the noise on the context they smooth over time, as much as their height says.
+        """
         if not self.clock:
             return np.empty((len(steps), 0))
-        return np.stack([2.0 * np.minimum(steps / rate / limit, 1.0) - 1.0 for limit in CLOCKS], axis=1)
+        time = np.minimum(steps / rate, CLOCK_SPAN)
+        return self.clock * np.exp(-0.5 * (time[:, None] / CLOCK_STEP - _bumps()) ** 2)
 
     def contexts(
         self, z: Float[np.ndarray, "N D"], history: Float[np.ndarray, "L D"], first_step: int, rate: float

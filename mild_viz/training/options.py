@@ -65,8 +65,8 @@ class TrainingOptions:
     """v4: models whose predictions are averaged."""
     lags: tuple[int, ...] = (10, 20)
     """v4: how many frames ago the further human latents of the context are taken."""
-    clock: bool = True
-    """v4: whether the time since the trial began is in the context."""
+    clock: float = 3.0
+    """v4: height of the bumps of the context that tell the time since the trial began; 0: none."""
     context_noise: float = 1.0
     """v4: variance of the noise on every number of the context [latent units squared]."""
     joint_floor: float = 1e-2
@@ -83,7 +83,7 @@ class TrainingOptions:
         for name in POSITIVE_NUMBERS:
             if not 0 < getattr(self, name) < float("inf"):
                 raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number above 0")
-        for name in ("beta", "held_out"):
+        for name in ("beta", "held_out", "clock"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise UserError(f"{name} is {getattr(self, name)}; valid: 0 or more")
         choose("state_model", self.state_model, list(STATE_MODELS))

@@ -107,8 +107,8 @@ def train_robot_stage(
             mean, log_std = net.encode(target)
             error = squared_error(net.decode(sampled(mean, log_std, rng)), target)
             kl = prior.kl(mean, log_std, rows).mean(1)
-            c = centre[:, rows]
-            spread = (factor[:, rows] @ noise_like(c, rng)[..., None])[..., 0]
+            c = centre.index_select(1, rows)
+            spread = (factor.index_select(1, rows) @ noise_like(c, rng)[..., None])[..., 0]
             # One Monte-Carlo sample and the mean itself, which is what is decoded at test time.
             decoded = net.decode(torch.cat([c + spread, c], dim=1))
             reached = squared_error(decoded, target.repeat(1, 2, 1)) * use
