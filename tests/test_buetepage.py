@@ -28,7 +28,7 @@ from mild_viz.evaluation.buetepage import (
     save_buetepage,
 )
 from mild_viz.evaluation.metrics import model_rows
-from mild_viz.evaluation.report import measure
+from mild_viz.evaluation.report import evaluate
 from mild_viz.pairs import stack_windows
 from mild_viz.settings import WINDOW
 from mild_viz.training.buetepage.networks import Gaussian, HumanDynamics, RobotDynamics, jensen_shannon, with_code
@@ -336,7 +336,7 @@ def test_the_command_trains_a_model_that_is_evaluated(
 ) -> None:
     source = load_dataset("demo")
     small = replace(source, train=tuple(few), test=source.test[::4])
-    monkeypatch.setattr("mild_viz.training.buetepage.run.load_dataset", lambda _: small)
+    monkeypatch.setattr("mild_viz.training.run.load_dataset", lambda _: small)
     out = tmp_path / "made"
     assert main(["train-baseline", "--out", str(out), "--seeds", "2", "--epochs", "1", "--seed", "5"]) == 0
     assert f"mild-viz evaluate --checkpoint {out} --dataset demo" in capsys.readouterr().out
@@ -345,12 +345,19 @@ def test_the_command_trains_a_model_that_is_evaluated(
     assert model.training["command"].endswith(f"--seeds 2 --epochs 1 --seed 5 --out {out}")
     assert len(model.training["held_out_trials"]) == N_ACTIONS and len(model.metrics["test_seeds"]) == 2
     assert model.metrics["held_out"][model.training["chosen"]] == min(model.metrics["held_out"])
-    rows = measure({"it": model}, small).measured[0].rows()
-    assert (
-        [row.as_dict() for row in rows]
-        == model.metrics["test"]
-        == model.metrics["test_seeds"][model.training["chosen"]]
-    )
+    assert model.metrics["test"] == model.metrics["test_seeds"][model.training["chosen"]]
+    # beside a MILD checkpoint, on the same windows
+    mild = save_checkpoint(random_checkpoint(), tmp_path / "mild", "").path
+    monkeypatch.setattr("mild_viz.evaluation.report.load_dataset", lambda _: small)
+    result = evaluate([mild, out], "demo")
+    rows = {(row.model, row.action): row for row in result.rows}
+    for of in model.metrics["test"]:
+        measured, beside = rows[BUETEPAGE, of["action"]], rows["v3.1", of["action"]]
+        assert measured.mse_mean == of["mse_mean"] and measured.checkpoint == "made"
+        assert (measured.n_windows, measured.n_trials) == (beside.n_windows, beside.n_trials)
+    assert {(one.model, one.statistic, one.n_runs) for one in result.over_runs} == {
+        (BUETEPAGE, "best", 2), (BUETEPAGE, "median", 2)
+    }  # fmt: skip
     assert "our implementation" in (out / "README.md").read_text().lower()
 
 

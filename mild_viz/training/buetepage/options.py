@@ -21,10 +21,8 @@ class BuetepageOptions:
     """Weight of the KL terms of the VAEs and of the robot dynamics."""
     batch_size: int = 256
     """Windows in a step of a VAE."""
-    batch_trials: int = 4
-    """Trials in a step of the dynamics."""
-    held_out: int = 1
-    """Trials of every action that are kept from training, to choose among the seeds."""
+    batch_trials: int = 1
+    """Trials in a step of the dynamics; one, as the authors have it."""
 
     def __post_init__(self) -> None:
         for name, most in (("seeds", 256), ("epochs", 100_000)):

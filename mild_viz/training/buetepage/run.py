@@ -11,12 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bars
 
 from mild_viz.checkpoint import RobotInterface, check_checkpoint_target
-from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.buetepage import BUETEPAGE, Buetepage, save_buetepage
 from mild_viz.evaluation.metrics import model_rows
@@ -28,11 +24,15 @@ from mild_viz.training.buetepage.stages import (
     train_robot_dynamics,
     train_vae,
 )
+from mild_viz.training.options import TrainingOptions
 from mild_viz.training.outcome import mean_error
-from mild_viz.training.progress import Progress
+from mild_viz.training.progress import Progress, shown
 from mild_viz.training.recordings import training_windows
-from mild_viz.training.run import hold_out, robot_interface
+from mild_viz.training.run import plan_run
 from mild_viz.trial import Dataset, Trial
+
+HUMAN_STAGES = ("human VAE", "human dynamics")
+STAGES = (*HUMAN_STAGES, "robot VAE", "robot dynamics")
 
 
 def train_buetepage(
@@ -53,15 +53,15 @@ def train_buetepage(
     if epochs is not None:
         options = replace(options, epochs=epochs)
     check_checkpoint_target(out)
-    source = load_dataset(dataset)
-    robot = None if human_human else robot_interface(dataset)
-    fit, held = hold_out(source.train, options.held_out)
+    plan = plan_run(dataset, "hri", ("v1",), TrainingOptions(seeds=seeds, seed=seed))
+    source, fit, held, robot = plan.source, plan.fit, plan.held, None if human_human else plan.robot
     actions = tuple(action for action in source.actions if any(trial.action == action for trial in fit))
     started = time.monotonic()
-    with one_thread(), _bars(options.epochs) as progress:
+    names = HUMAN_STAGES if human_human else STAGES
+    with one_thread(), shown(dict.fromkeys(names, options.epochs), False, None) as progress:
         trained = train_models(fit, actions, robot, options, progress)
     candidates = [
-        Buetepage(out, out.name, source.name, source.checksum, actions, robot, vae, tensors, rate=float(fit[0].rate))
+        Buetepage(out, out.name, source.name, source.checksum, actions, robot, vae, tensors, rate=plan.rate)
         for vae, tensors in trained
     ]
     scores = [mean_error(model_rows(candidate, held), BUETEPAGE) for candidate in candidates] if held else []
@@ -124,25 +124,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def _bars(n_epochs: int) -> Iterator[Progress]:
-    """A progress bar a stage, which appears when the stage begins."""
-    columns = (
-        TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        TextColumn("{task.fields[values]}"),
-    )  # fmt: skip
-    with Bars(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(stage: str, epoch: int, _: int, values: dict[str, float]) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=n_epochs, values="")
-            text = "  ".join(f"{key} {value:.4f}" for key, value in values.items())
-            bars.update(tasks[stage], completed=epoch, values=text)
-
-        yield progress
 
 
 def _readme(model: Buetepage, source: Dataset) -> str:

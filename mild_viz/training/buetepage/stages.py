@@ -1,7 +1,12 @@
 """The four stages: human VAE, human dynamics, robot VAE, robot dynamics. All seeds train together.
 
-Losses are weighed as the paper's authors do in their implementation: means over dimensions (in units of the
-recording) in all stages but the last, sums there.
+Losses are weighed as the paper's authors do in their implementation (github.com/souljaboy764/buetepage-phri): means
+over dimensions (in units of the recording) in all stages but the last, sums there. Where ours departs from it:
+- Both LSTMs read the frame before the window that they predict. Theirs read its first frame, also the robot's while
+  training, and so a frame later than the one that they get when they run on their own predictions.
+- The robot starts from the rest pose; theirs starts from the true first frame.
+- Inputs are standardised; posteriors are diagonal; where no second human was recorded (HRI-Yumi), the human dynamics
+  train on the one human alone, theirs come from another data set.
 """
 
 from __future__ import annotations
@@ -24,8 +29,9 @@ from mild_viz.training.buetepage.networks import (
     with_code,
 )
 from mild_viz.training.buetepage.options import BuetepageOptions
-from mild_viz.training.human_stage import Progress, batches, standardisation
 from mild_viz.training.networks import BatchedVAE, standard_kl
+from mild_viz.training.priors import batches, standardisation
+from mild_viz.training.progress import Progress
 from mild_viz.trial import Trial
 
 
@@ -93,7 +99,7 @@ def _descend(
     progress: Progress,
     losses: Callable[[], Iterator[dict[str, Tensor]]],
 ) -> None:
-    """AdamW over epochs of `losses`, whose terms are added."""
+    """AdamW over epochs of `losses`, whose terms are added; they are sums over seeds, and reported as means."""
     optimizer = torch.optim.AdamW(net.parameters(), lr=options.learning_rate)
     for epoch in range(options.epochs):
         totals: dict[str, float] = {}
@@ -104,7 +110,7 @@ def _descend(
             optimizer.step()
             n_batches += 1
             for name, term in terms.items():
-                totals[name] = totals.get(name, 0.0) + float(term.detach())
+                totals[name] = totals.get(name, 0.0) + float(term.detach()) / options.seeds
         progress(stage, epoch + 1, options.epochs, {name: total / n_batches for name, total in totals.items()})
 
 
