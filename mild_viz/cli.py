@@ -43,8 +43,8 @@ def app(
     Example: mild-viz app --dataset nuisi --action handshake --variant v3.2
 
     Args:
-        checkpoint: Folder of a trained model. Default: the shipped model of the dataset, that is checkpoints/demo
-            for demo, checkpoints/nuisi-pepper for nuisi. Example: --checkpoint checkpoints/nuisi-pepper
+        checkpoint: Folder of a trained model. Default: the shipped model of the dataset: checkpoints/demo,
+            nuisi-pepper, yumi or handover-panda. Example: --checkpoint checkpoints/nuisi-pepper
         dataset: Recordings to open: demo (built in), nuisi, yumi, handover, buetepage (see: mild-viz data list).
             Example: --dataset nuisi
         action: Interaction to show first: wave, handshake, rocket, parachute, handover. Default: the handshake, if

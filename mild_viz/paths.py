@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mild_viz.errors import UserError
 
-SHIPPED_MODELS = {"demo": "demo", "nuisi": "nuisi-pepper"}
+SHIPPED_MODELS = {"demo": "demo", "nuisi": "nuisi-pepper", "yumi": "yumi", "handover": "handover-panda"}
 """Folder under `checkpoints/` that holds the model for a dataset."""
 
 PACKAGE = Path(__file__).resolve().parent

@@ -185,4 +185,4 @@ def test_shipped_folders_are_found_or_named(tmp_path: Path, monkeypatch: pytest.
 def test_default_checkpoint_follows_the_dataset() -> None:
     assert paths.default_checkpoint("nuisi") == paths.checkpoints() / "nuisi-pepper"
     with pytest.raises(UserError, match="models ship for demo, nuisi"):
-        paths.default_checkpoint("yumi")
+        paths.default_checkpoint("buetepage")
