@@ -38,7 +38,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         UserError: if the checkpoint does not know the variant or the action, or the trial is too short.
     """
     interface = checkpoint.for_robot()
-    check_rate(checkpoint.rate, f"checkpoint {checkpoint.name}", [trial])
+    check_rate(checkpoint.rate, checkpoint.name, [trial])
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
         raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")

@@ -28,6 +28,7 @@ def model_for(dataset: str, folder: Path) -> Path:
     checkpoint = replace(
         random_checkpoint(variants=("v3.1",)),
         dataset=dataset,
+        rate=load_dataset(dataset).test[0].rate,
         robot=interface,
         hmms={action: random_hmm(rng, 6, 10) for action in load_dataset(dataset).actions},
         robot_vaes={"v3.1": random_vae(rng, 5 * len(interface.joint_names))},
