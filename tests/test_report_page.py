@@ -104,9 +104,8 @@ def small_demo(small: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
 
 
 def human_human(checkpoint: Checkpoint) -> Checkpoint:
-    return replace(
-        checkpoint, robot=None, robot_vaes={}, own_models={}, name="people", contact_states={}, placement=None
-    )
+    nothing = {"robot_vaes": {}, "own_models": {}, "own_contact_states": {}, "contact_states": {}}
+    return replace(checkpoint, robot=None, name="people", placement=None, **nothing)
 
 
 def test_the_page_holds_all_parts_and_stands_alone(
