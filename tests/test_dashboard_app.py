@@ -89,7 +89,8 @@ def test_a_checkpoint_for_another_robot_is_refused(tmp_path: Path, model: Path, 
 
 
 def test_a_model_of_two_humans_drives_no_robot(tmp_path: Path, model: Path) -> None:
-    save_checkpoint(replace(load_checkpoint(model), robot=None, robot_vaes={}), tmp_path / "hhi", "for a test")
+    nothing = {"robot_vaes": {}, "own_models": {}, "own_contact_states": {}}
+    save_checkpoint(replace(load_checkpoint(model), robot=None, **nothing), tmp_path / "hhi", "for a test")
     with pytest.raises(UserError, match="human-human model"):
         open_dashboard(checkpoint=tmp_path / "hhi", port=port())
 

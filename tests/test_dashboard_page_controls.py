@@ -77,7 +77,7 @@ def test_placement_moves_the_human_and_can_be_reset(paused: Page, dashboard: Das
     assert moved.placement.distance == pytest.approx(distance)
     assert np.linalg.norm(moved.T_world_human[:3, 3] - first.T_world_human[:3, 3]) == pytest.approx(0.2, abs=0.02)
     eventually(
-        lambda: "Chosen on this page" in page.locator(".mv-note", has_text="page").first.inner_text(), "it says so"
+        lambda: "Chosen on this page" in page.locator(".mv-note", has_text="this page").first.inner_text(), "it says so"
     )
     back = after(dashboard, lambda: page.get_by_role("button", name="Reset placement").click(), 0, 1)
     assert np.array_equal(back.T_world_human, first.T_world_human)
