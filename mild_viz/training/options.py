@@ -78,8 +78,9 @@ class TrainingOptions:
         for name, most in WHOLE_NUMBERS.items():
             value = getattr(self, name)
             for number in value if isinstance(value, tuple) else (value,):
-                if not 1 <= number <= most:
-                    raise UserError(f"{name} is {value}; valid: 1 to {most}")
+                least = 0 if name.endswith("em_iterations") else 1  # none: the equal split in time itself
+                if not least <= number <= most:
+                    raise UserError(f"{name} is {value}; valid: {least} to {most}")
         for name in POSITIVE_NUMBERS:
             if not 0 < getattr(self, name) < float("inf"):
                 raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number above 0")
