@@ -228,7 +228,15 @@ def test_settings_are_ranked_by_held_out_error_never_by_the_test_split() -> None
     def rows(beta: float, held_out: list[float], test: list[float]) -> list[dict[str, Any]]:
         shared = {"dataset": "demo", "variant": "v3.1", "beta": beta}
         return [
-            {**shared, "cell": f"{beta}-{seed}", "seed": seed, "action": action, "held_out_mse": one, "test_mse": two}
+            {
+                **shared,
+                "cell": f"{beta}-{seed}",
+                "seed": seed,
+                "fold": -seed,
+                "action": action,
+                "held_out_mse": one,
+                "test_mse": two,
+            }
             for seed, (one, two) in enumerate(zip(held_out, test, strict=True))
             for action in ("wave", "handshake")
         ]
@@ -238,9 +246,9 @@ def test_settings_are_ranked_by_held_out_error_never_by_the_test_split() -> None
     )
     columns = {str(column.header): list(column.cells) for column in table.columns}
     assert list(columns) == [
-        "dataset", "variant", "beta", "seeds", "held-out mean", "held-out median", "test mean", "test median",
+        "dataset", "variant", "beta", "runs", "held-out mean", "held-out median", "test mean", "test median",
     ]  # fmt: skip
     assert columns["beta"] == ["0.3", "0.1", "0.2"]  # an error that is no number is never best, and shows
     assert columns["held-out mean"] == ["3.0000", "5.0000", "nan"]
     assert columns["held-out median"] == ["2.0000", "3.0000", "nan"]
-    assert columns["seeds"] == ["3", "3", "3"]
+    assert columns["runs"] == ["3", "3", "3"]
