@@ -289,12 +289,15 @@ def test_a_diverged_seed_is_never_chosen() -> None:
         choose_seed([bad, bad])
 
 
-def test_recordings_without_contact_or_without_any_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recordings_without_contact_or_without_any_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     whole = load_dataset("demo")
     waves = replace(whole, train=tuple(t for t in whole.train if t.action == "wave")[:3], test=whole.test)
     monkeypatch.setattr(training_run, "load_dataset", lambda _: waves)
     made = train("demo", "hri", ("v3.1",), quick(1, 1), tmp_path / "waves")
     assert made.placement is None and made.actions == ("wave",)
+    assert "note: no training trial shows handshake, rocket, parachute" in capsys.readouterr().err
 
     unseen = [replace(t, human_arm=np.full_like(t.human_arm, np.nan)) for t in waves.train]
     monkeypatch.setattr(training_run, "load_dataset", lambda _: replace(waves, train=tuple(unseen)))

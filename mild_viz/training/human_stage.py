@@ -111,7 +111,7 @@ def train_human_stage(
             models, priors[:] = fit_models(options.em_iterations)
     for epoch in range(first, n_epochs):
         totals = {"reconstruction": 0.0, "kl": 0.0}
-        for rows in batches(len(usable.trial), options.batch_size, rng):
+        for rows in batches(len(usable.trial), options.batch_size, rng, options.device):
             loss = torch.zeros((), device=options.device)
             for vae, x, prior in zip((net.human, net.partner), (x_human, x_partner), priors, strict=True):
                 target = x[rows].expand(options.seeds, -1, -1)

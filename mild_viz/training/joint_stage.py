@@ -145,7 +145,7 @@ def train_joint_stage(
             _, priors = refit(options.em_iterations)
     for epoch in range(first, n_epochs):
         totals = {"reconstruction": 0.0, "kl": 0.0, "conditional": 0.0}
-        for rows in batches(len(usable.trial), options.batch_size, rng):
+        for rows in batches(len(usable.trial), options.batch_size, rng, device):
             human, partner = (x[rows].expand(n_models, -1, -1) for x in (x_human, x_partner))
             (mean_h, log_std_h), (mean_r, log_std_r) = net.human.encode(human), net.partner.encode(partner)
             newest = sampled(mean_h, log_std_h, rng)

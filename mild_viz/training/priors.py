@@ -85,10 +85,10 @@ class StatePriors:
         return gaussian_kl(mean, log_std, self._mean[which], self._precision[which], self._log_det[which])
 
 
-def batches(n_rows: int, size: int, rng: torch.Generator) -> Sequence[Tensor]:
-    """Row indices of one epoch in random order, in batches of equal size."""
+def batches(n_rows: int, size: int, rng: torch.Generator, device: str = "cpu") -> Sequence[Tensor]:
+    """Row indices of one epoch in random order (the CPU's, on any device), in batches of equal size."""
     n_batches = max(1, n_rows // size)
-    return torch.randperm(n_rows, generator=rng)[: n_batches * size].chunk(n_batches)
+    return torch.randperm(n_rows, generator=rng)[: n_batches * size].to(device).chunk(n_batches)
 
 
 def standardisation(x: np.ndarray) -> tuple[Tensor, Tensor]:

@@ -102,7 +102,7 @@ def train_robot_stage(
     first = trainer.restore(saved) if saved is not None else 0
     for epoch in range(first, options.robot_epochs):
         totals = {"reconstruction": 0.0, "kl": 0.0, "conditional": 0.0}
-        for rows in batches(len(x), options.batch_size, rng):
+        for rows in batches(len(x), options.batch_size, rng, device):
             target = x[rows].expand(n_models, -1, -1)
             mean, log_std = net.encode(target)
             error = squared_error(net.decode(sampled(mean, log_std, rng)), target)

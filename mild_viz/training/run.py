@@ -159,6 +159,9 @@ def train(
     """
     check_checkpoint_target(out)
     plan = plan_run(dataset, stage, variants, options or TrainingOptions(), init)
+    unseen = [name for name in plan.source.actions if all(trial.action != name for trial in plan.source.train)]
+    if unseen and not quiet:
+        print(f"note: no training trial shows {', '.join(unseen)}: the model will not know it", file=sys.stderr)
     command = command or shlex.join(["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--out", str(out)])
     description = {
         "dataset": dataset,
