@@ -102,7 +102,9 @@ def _train_from(
 
 def _say_what_next(made: Checkpoint | Buetepage) -> None:
     chosen, n_seeds = made.training["chosen"], made.training["options"]["seeds"]
-    print(f"{made.path}: seed {chosen} of {n_seeds} had the lowest error on held-out training trials")
+    scored = any(made.metrics.get("held_out", ()))
+    why = "had the lowest error on held-out training trials" if scored else "is kept: no held-out trial to choose by"
+    print(f"{made.path}: seed {chosen} of {n_seeds} {why}")
     print(f"next: mild-viz evaluate --checkpoint {made.path} --dataset {made.dataset}")
 
 
