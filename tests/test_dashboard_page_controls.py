@@ -109,7 +109,7 @@ def test_contact_states_gate_the_controller_and_are_saved(paused: Page, dashboar
         page.get_by_text("Not saved: ").wait_for()
 
 
-def test_trial_action_and_variant_rerun_everything(paused: Page, dashboard: Dashboard) -> None:
+def test_trial_action_and_variant_rerun_everything(paused: Page, dashboard: Dashboard, model: Path) -> None:
     page = paused
     tab(page, "Trial")
     first = shown(dashboard)
@@ -120,7 +120,15 @@ def test_trial_action_and_variant_rerun_everything(paused: Page, dashboard: Dash
     covariance = after(dashboard, lambda: choose(page, "Variant", "v3.2"), 1, 1)
     assert covariance.inference.variant == "v3.2"
     page.get_by_text("The posterior's spread is").wait_for()
-    after(dashboard, lambda: choose(page, "Variant", "v3.1"), 1, 1)
+    own = after(dashboard, lambda: choose(page, "Variant", "v4"), 1, 1)
+    page.get_by_text("the first of its models is drawn").wait_for()
+    assert not np.array_equal(own.inference.active_state, second.inference.active_state)
+    strip = page.locator(".mv-states .mv-strip .mv-segment")
+    eventually(lambda: strip.count() == 1 + np.count_nonzero(np.diff(own.inference.active_state)), "the strip follows")
+    assert "robot ×" in scene_props(page, "/latent/caption")["text"]
+    back = after(dashboard, lambda: choose(page, "Variant", "v3.1"), 1, 1)
+    assert np.array_equal(back.inference.active_state, second.inference.active_state)
+    assert back.contact_states == load_checkpoint(model).contact_states_of("v3.1", "handshake"), "as it is stored"
     wave = after(dashboard, lambda: choose(page, "Action", "wave"), 1, 1)
     assert wave.inference.action == "wave"
     header = page.locator(".mv-header").first

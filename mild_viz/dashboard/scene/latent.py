@@ -53,7 +53,7 @@ class LatentFrames:
     opacity: Float[np.ndarray, "N S"]
     projection: Projection
     magnification: float
-    """How often the robot's latents are enlarged (`projection.magnified`)."""
+    """How many times the robot's latents are enlarged (`projection.magnified`)."""
 
 
 def latent_frames(inference: Inference, view: ViewSettings) -> LatentFrames:

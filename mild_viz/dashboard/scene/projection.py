@@ -64,7 +64,7 @@ class Projection:
 
 
 def magnified(inference: Inference) -> tuple[Inference, float]:
-    """The robot's latents enlarged about their middle until they spread about as far as the human's, and how often.
+    """The robot's latents enlarged about their middle to up to half of the human's spread, and how many times.
 
     The two live in latent spaces of their own, so that their spreads need not agree (in v4 the human's is up to
     fifteen times wider, and the robot would be a dot). A spread of a similar size is left alone.
@@ -78,7 +78,7 @@ def magnified(inference: Inference) -> tuple[Inference, float]:
         )
     )
     ratio = float(human / max(robot, 1e-9))
-    factor = min(nice_step(ratio), 100.0) if ratio >= 3.0 else 1.0
+    factor = min(nice_step(0.5 * ratio), 100.0) if ratio >= 4.0 else 1.0
     middle = inference.robot_state_means.mean(0)
     names = ("robot_latent_mean", "robot_latent_truth", "robot_state_means")
     changes = {name: middle + factor * (getattr(inference, name) - middle) for name in names}
