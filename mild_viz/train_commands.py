@@ -119,7 +119,8 @@ def train_baseline(
     """Train the recurrent baseline that the paper compares with: Bütepage et al. (2020), our implementation.
 
     Its four stages are the human's variational autoencoder, the human's recurrent dynamics, and both of the robot,
-    which is the recorded one, else Pepper by retargeting the second human. It is measured by evaluate like any model;
+    which is the recorded one, else the one that the second human is retargeted to. It keeps no state: an interrupted
+    run begins anew. It is measured by evaluate like any model;
     the best seed is chosen on training trials that are held out, never on the test set.
     Example: mild-viz train-baseline --dataset nuisi --out runs/nuisi-buetepage
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,7 @@ from mild_viz.dashboard.server import free_port
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.rollout import Rollout
 
 
 def port() -> int:
@@ -89,8 +92,8 @@ def test_a_checkpoint_for_another_robot_is_refused(tmp_path: Path, model: Path, 
 
 
 def test_a_model_of_two_humans_drives_no_robot(tmp_path: Path, model: Path) -> None:
-    nothing = {"robot_vaes": {}, "own_models": {}, "own_contact_states": {}}
-    save_checkpoint(replace(load_checkpoint(model), robot=None, **nothing), tmp_path / "hhi", "for a test")
+    two = replace(load_checkpoint(model), robot=None, robot_vaes={}, own_models={}, own_contact_states={})
+    save_checkpoint(two, tmp_path / "hhi", "for a test")
     with pytest.raises(UserError, match="human-human model"):
         open_dashboard(checkpoint=tmp_path / "hhi", port=port())
 
@@ -130,6 +133,62 @@ def test_real_recordings_come_with_the_model_made_for_them(robot: RobotModel, da
     assert "nuisi" in catalog.offers()[0]
     dataset("yumi")
     assert catalog.models("yumi") == () and "recorded the joints" in str(catalog.problem("demo", "yumi"))
+    assert catalog.offers()[1]["yumi"] == "it has another robot, YuMi; open it with: mild-viz app --dataset yumi"
+    assert not {"nuisi-human", "handover-human"} & {*catalog.models("nuisi"), *catalog.models("demo")}
+
+
+@pytest.mark.parametrize(("name", "robot_name", "n_joints"), [("yumi", "yumi", 7), ("handover", "panda", 7)])
+def test_another_robots_dataset_opens_with_its_shipped_model(
+    name: str, robot_name: str, n_joints: int, dataset: Callable[[str], Any]
+) -> None:
+    dataset(name)
+    page = open_dashboard(dataset=name, variant="v4", port=port())
+    try:
+        assert page.session.wait_idle() and page.session.error is None
+        rollout, intro = page.session.rollout, page.controls._states._intro.content
+        assert rollout is not None and rollout.robot == robot_name
+        assert rollout.joints_commanded.shape[1] == n_joints and rollout.inference.variant == "v4"
+        if name == "yumi":  # nothing tells where the hands meet, and the page says what that means
+            assert rollout.contact_states == frozenset() and "No state of <b>handshake</b>" in intro
+            assert "Saved: no contact states for handshake" in page.controls._states._saved.content
+        else:
+            assert rollout.contact.any() and "States of contact in <b>handover</b>, v4" in intro
+    finally:
+        for thread in threading.enumerate():
+            if thread.name == "mild_viz datasets":
+                thread.join(timeout=20.0)  # else it writes to a page that is gone
+        page.stop()
+
+
+def test_v4_has_its_own_states_and_contact_states(dashboard: Dashboard, model: Path) -> None:
+    """Saved where they belong: those that v1 to v3.2 share stay as they are."""
+    states, session, dropdown = dashboard.controls._states, dashboard.session, dashboard.controls._trial._variant
+
+    def use(variant: str) -> Rollout:
+        dropdown.value = variant
+        session.mark_dirty()
+        assert session.wait_idle() and session.error is None and session.rollout is not None
+        return session.rollout
+
+    before = use("v3.1")
+    rollout = use("v4")
+    assert not np.array_equal(rollout.inference.active_state, before.inference.active_state)
+    checkpoint = load_checkpoint(model)
+    own = checkpoint.contact_states_of("v4", "handshake")
+    assert rollout.contact_states == own and "its own states" in dashboard.controls._trial._note.content
+    state = min(own)
+    states._boxes[state].value = False
+    assert use("v4").contact_states == own - {state}
+    dashboard.controls._save_contact_states()
+    saved = json.loads((model / "contact_states.json").read_text())
+    assert set(saved["v4"]["handshake"]) == own - {state}
+    assert load_checkpoint(model).contact_states == checkpoint.contact_states
+    assert use("v3.1").contact_states == before.contact_states
+    assert use("v4").contact_states == own - {state}, "as saved"
+    states.tick(own)
+    assert use("v4").contact_states == own
+    dashboard.controls._save_contact_states()
+    use("v3.1")
 
 
 def test_switching_the_dataset_brings_its_model_actions_and_trials(

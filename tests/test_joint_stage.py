@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from mild_viz.checkpoint import RobotInterface, save_checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import model_rows
@@ -63,7 +64,7 @@ def data(few: list[Trial]) -> Windows:
 
 def test_training_conditions_as_the_running_model_does(data: Windows) -> None:
     """The batched network's conditional of every complete row is that of the exported model, run over the trial."""
-    net = make_agents(complete_rows(data), False, 4, QUICK, torch.Generator().manual_seed(0), None)
+    net = make_agents(complete_rows(data), False, 4, QUICK, torch.Generator().manual_seed(0))
     conditioning = Conditioning(data, ContextLayout(QUICK.lags, QUICK.clock), RATE, "cpu")
     models, alphas = fit_models(net, data, conditioning, QUICK, 3)
     conditioning.update(alphas, models)
@@ -114,7 +115,7 @@ def test_it_learns_and_its_gradient_reaches_the_humans_encoder(few: list[Trial],
         constant.append(((usable.partner[of].mean(0) - test.partner[rows])[complete] ** 2).mean())
     assert np.mean(errors) < 0.5 * np.mean(constant)
 
-    net = make_agents(usable, False, 4, QUICK, torch.Generator().manual_seed(0), None)
+    net = make_agents(usable, False, 4, QUICK, torch.Generator().manual_seed(0))
     conditioning = Conditioning(data, ContextLayout(QUICK.lags, QUICK.clock), RATE, "cpu")
     models, alphas = fit_models(net, data, conditioning, QUICK, 2)
     conditioning.update(alphas, models)
@@ -330,3 +331,34 @@ def test_a_trial_of_another_rate_is_refused_by_the_pipeline() -> None:
 def test_models_of_v4_share_their_layout(data: Windows) -> None:
     ((model, *_), *_) = train_joint_stage(data, RATE, replace(QUICK, joint_epochs=1), silent)
     assert isinstance(model, InteractionModel) and model.layout == ContextLayout(QUICK.lags, QUICK.clock)
+
+
+def test_fine_tuned_members_start_from_different_ones(data: Windows) -> None:
+    first = random_checkpoint(n_own=2).members("v4")
+    net = make_agents(complete_rows(data), False, 4, QUICK, torch.Generator().manual_seed(0), first)
+    for m in range(4):
+        found, meant = net.human.export(m).weights["posterior_mean.weight"], first[m % 2].human_vae.weights
+        np.testing.assert_allclose(found, meant["posterior_mean.weight"], atol=1e-6)
+
+
+def test_a_robot_of_other_joints_starts_afresh(
+    few: list[Trial], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_run, "load_dataset", lambda _: small_dataset(few))
+    other = replace(random_checkpoint(), robot_vaes={"v3.1": random_vae(np.random.default_rng(0), 35)})
+    start = replace(other, robot=RobotInterface("panda", ROBOTS["panda"].joint_names, ROBOTS["panda"].end_effector))
+    folder = save_checkpoint(start, tmp_path / "panda", "for a test").path
+    made = train("demo", "hri", ("v3.1",), QUICK, tmp_path / "model", init=folder, quiet=True)
+    assert made.members("v3.1")[0].robot_vae.input_size == 20
+
+
+def test_every_trial_is_checked_before_anything_is_trained(
+    few: list[Trial], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test = load_dataset("demo").test
+    short = Trial("demo", "test", 3, "wave", RATE, test[0].human_arm[:8], test[0].partner_arm[:8])  # pyright: ignore[reportOptionalSubscript]
+    for tests, message in (((short,), "trial demo/test/3 has 8 frames"), ((), "has no test trial of handshake, ")):
+        monkeypatch.setattr(training_run, "load_dataset", lambda _, tests=tests: small_dataset(few, test=tests))
+        with pytest.raises(UserError, match=message):
+            train("demo", "hri", ("v1",), QUICK, tmp_path / "model")
+    assert not list(tmp_path.iterdir())

@@ -27,7 +27,7 @@ from mild_viz.dashboard.scene.latent import (
 )
 from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, Camera, picture_axes
 from mild_viz.dashboard.scene.palette import DARK, LIGHT, linear, state_color
-from mild_viz.dashboard.scene.projection import LARGEST_RADIUS, make_projection, nice_step
+from mild_viz.dashboard.scene.projection import LARGEST_RADIUS, magnified, make_projection, nice_step
 from mild_viz.dashboard.scene.scene import Scene
 from mild_viz.dashboard.scene.shapes import ball, limb, limb_poses, quaternion_from_matrix, rotate
 from mild_viz.dashboard.view import ViewSettings
@@ -294,6 +294,27 @@ def test_outliers_are_cut_off(rollout: Rollout) -> None:
     assert np.isfinite(centres).all() and (np.abs(centres) <= 0.5 * PLOT_SIZE).all() and radii.max() <= LARGEST_RADIUS
     spread_of_path = np.ptp(projection.points(inference.human_latent_mean), axis=0)
     assert spread_of_path.max() > 0.2 * PLOT_SIZE, "one lost state must not shrink the rest to a dot"
+
+
+def test_a_robot_whose_latents_hardly_spread_is_enlarged_and_the_plot_says_so(
+    server: viser.ViserServer, scene: Scene, rollout: Rollout
+) -> None:
+    """As in v4, whose human latents spread fifteen times as far: its whole way was cut off, the robot's was a dot."""
+    plain = rollout.inference
+    scene.show(rollout, ViewSettings())
+    assert "×" not in node(server, "/latent/caption").text
+    names = ("human_latent_mean", "human_state_means")
+    wide: dict[str, Any] = {name: 15.0 * getattr(plain, name) for name in names}
+    inference = replace(plain, **wide, human_state_covariances=225.0 * plain.human_state_covariances)
+    enlarged, factor = magnified(inference)
+    assert factor in (5.0, 10.0, 20.0)
+    spread = (inference.robot_state_means - inference.robot_state_means.mean(0)) * factor
+    np.testing.assert_allclose(enlarged.robot_state_means - enlarged.robot_state_means.mean(0), spread, atol=1e-9)
+    np.testing.assert_allclose(enlarged.robot_state_covariances, factor**2 * plain.robot_state_covariances)
+    points = make_projection(inference, "pca").points(inference.human_latent_mean)
+    assert (np.abs(points[np.isfinite(points).all(1)]) <= 0.5 * PLOT_SIZE).mean() > 0.99, "the way is not cut off"
+    scene.show(replace(rollout, inference=inference), ViewSettings())
+    assert node(server, "/latent/caption").text.endswith(f"robot ×{factor:g}")
 
 
 def test_principal_components_are_ordered_and_labelled(rollout: Rollout) -> None:

@@ -10,6 +10,7 @@ from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel
+from mild_viz.robot.robots import robot_title
 from mild_viz.trial import Dataset, Trial
 
 
@@ -123,8 +124,16 @@ class Catalog:
             if self.models(name):
                 usable.append(name)
             else:
-                others[name] = "no model here fits it"
+                others[name] = self._how_else(name)
         return tuple(usable), others
+
+    def _how_else(self, dataset: str) -> str:
+        """A page shows one robot: where the dataset's own model drives another, how to open that."""
+        model = paths.SHIPPED_MODELS.get(dataset)
+        robot = self.checkpoint(model).robot if model in self.model_paths else None
+        if robot is None or robot.joint_names == self._robot.chain.joint_names:
+            return "no model here fits it"
+        return f"it has another robot, {robot_title(robot.name)}; open it with: mild-viz app --dataset {dataset}"
 
     def actions(self, model: str, dataset: str) -> tuple[str, ...]:
         """The interactions that both know."""

@@ -149,7 +149,9 @@ def _compare(first: Measured, second: Measured, names: tuple[str, str], action: 
     actions = [first.actions[i] for i in trials]
     counts = np.bincount(index)
     sums = np.bincount(index, a - b)
-    difference = np.mean([(a - b)[np.isin(trial, trials[np.array(actions) == name])].mean() for name in set(actions)])
+    difference = np.mean(
+        [(a - b)[np.isin(trial, trials[np.array(actions) == name])].mean() for name in dict.fromkeys(actions)]
+    )
     low = high = a12 = windows_p = flip_p = rank_p = float("nan")
     if np.isfinite(difference):
         test = stats.mannwhitneyu(a, b)

@@ -22,7 +22,7 @@ CLOCK_STEP = 1.0
 """Distance and width of the bumps that tell the time [s]: as exact as people are on time."""
 
 CLOCK_SPAN = 15.0
-"""Time after which the clock stands still [s]: trials are not longer."""
+"""Time after which the clock stands still [s]: few trials are longer."""
 
 MAX_LAG = 1000
 """Longest lag [frames]."""

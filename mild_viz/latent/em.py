@@ -32,7 +32,10 @@ def equal_segments(sequences: Sequence[Float[np.ndarray, "_ D"]], n_states: int,
         for state, part in enumerate(np.array_split(sequence, n_states)):
             parts[state].append(part[observed_rows(part)])
     pooled = [np.concatenate(part) for part in parts]
-    stay = 1.0 - n_states / np.mean([len(sequence) for sequence in sequences])
+    everything = np.concatenate(pooled)
+    # A part of which nothing was observed knows no better than the whole.
+    pooled = [part if len(part) else everything for part in pooled]
+    stay = max(0.01, 1.0 - n_states / np.mean([len(sequence) for sequence in sequences]))
     transition = np.full((n_states, n_states), TRANSITION_FLOOR)
     for state in range(n_states - 1):
         transition[state, state] = stay

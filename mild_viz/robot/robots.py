@@ -8,6 +8,12 @@ from pathlib import Path
 from mild_viz.errors import UserError
 from mild_viz.paths import assets
 
+
+def robot_title(name: str) -> str:
+    """A robot's name as its maker writes it; one that is not known by name is only capitalised."""
+    return {"yumi": "YuMi"}.get(name, f"{name[:1].upper()}{name[1:]}")
+
+
 PEPPER_JOINTS = ("RShoulderPitch", "RShoulderRoll", "RElbowYaw", "RElbowRoll")
 """Joints of Pepper's right arm that the model controls, in the column order of the retargeting."""
 

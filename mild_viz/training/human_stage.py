@@ -5,6 +5,7 @@ Where the partner was recorded as a robot (HRI-Yumi) it has a VAE of its own, an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,9 +47,14 @@ class Agents(nn.Module):
 
 
 def make_agents(
-    data: Windows, shared: bool, n_models: int, options: TrainingOptions, rng: torch.Generator, init: Checkpoint | None
+    data: Windows,
+    shared: bool,
+    n_models: int,
+    options: TrainingOptions,
+    rng: torch.Generator,
+    start: Sequence[InteractionModel] = (),
 ) -> Agents:
-    """Fresh VAEs in the units of the data, or with the weights of `init`'s (the partner's where it fits)."""
+    """Fresh VAEs in the units of the data, or with the weights of `start`, in turn (the partner's where it fits)."""
 
     def fresh(offset: Tensor, scale: Tensor) -> BatchedVAE:
         return BatchedVAE(n_models, offset, scale, options.hidden, options.latent_size, rng)
@@ -57,11 +63,11 @@ def make_agents(
         human = partner = fresh(*standardisation(np.concatenate([data.human, data.partner])))
     else:
         human, partner = fresh(*standardisation(data.human)), fresh(*standardisation(data.partner))
-    if init is not None:
-        start = init.members(init.variants[-1])[0]
-        human.load(init.human_vae if shared else start.human_vae)
-        if not shared and start.robot_vae.input_size == data.partner.shape[1]:
-            partner.load(start.robot_vae)
+    for m in range(n_models if start else 0):
+        model = start[m % len(start)]
+        human.load(model.human_vae, m)
+        if not shared and model.robot_vae.input_size == data.partner.shape[1]:
+            partner.load(model.robot_vae, m)
     return Agents(human, partner).to(options.device)
 
 
@@ -82,7 +88,10 @@ def train_human_stage(
     """
     rng = torch.Generator().manual_seed(options.seed)
     usable = complete_rows(data)
-    net = make_agents(usable, shared, options.seeds, options, rng, init)
+    # v4's own models have seen the trials that seeds are chosen by: the shared ones start from the shared ones
+    names = () if init is None else [name for name in init.variants if name not in init.own_models]
+    start = init.members(names[-1]) if init is not None and names else ()
+    net = make_agents(usable, shared, options.seeds, options, rng, start)
     x_human = net.human.standardise(torch.tensor(usable.human, dtype=torch.float32, device=options.device))
     x_partner = net.partner.standardise(torch.tensor(usable.partner, dtype=torch.float32, device=options.device))
     n_batches = len(batches(len(usable.trial), options.batch_size, rng))

@@ -122,7 +122,8 @@ def train_joint_stage(
     rng = torch.Generator().manual_seed(options.seed + 2)
     usable = complete_rows(data)
     n_models, size, device = options.seeds * options.members, options.latent_size, options.device
-    net = make_agents(usable, False, n_models, options, rng, init)
+    start = () if init is None else init.members(init.variants[-1])  # its v4, where it has one
+    net = make_agents(usable, False, n_models, options, rng, start)
     x_human = net.human.standardise(torch.tensor(usable.human, dtype=torch.float32, device=device))
     x_partner = net.partner.standardise(torch.tensor(usable.partner, dtype=torch.float32, device=device))
     conditioning = Conditioning(data, ContextLayout(options.lags, options.clock), rate, device)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mild_viz.errors import UserError
-from mild_viz.latent.context import MAX_LAG
+from mild_viz.latent.context import MAX_LAG, ContextLayout
 from mild_viz.latent.state_models import STATE_MODELS
-from mild_viz.settings import choose
+from mild_viz.settings import VARIANTS, choose
 
 WHOLE_NUMBERS = {
     "seeds": 256, "human_epochs": 100_000, "robot_epochs": 100_000, "hidden": 10_000, "latent_size": 1000,
@@ -24,6 +25,23 @@ POSITIVE_NUMBERS = (
     "context_noise",
 )
 DEVICES = ("cpu", "cuda")
+
+
+STAGES = ("hhi", "hri")
+
+
+def stage_variants(stage: str, variants: Sequence[str]) -> tuple[str, ...]:
+    """The variants that a stage trains of those asked for, each once.
+
+    A human-human model is v1 by construction, since its one VAE serves both and there is no robot; v4 has its own.
+    """
+    choose("stage", stage, STAGES)
+    names = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
+    if not names:
+        raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
+    if stage == "hhi":
+        names = tuple(name for name in names if VARIANTS[name].own_models or name == "v1") or ("v1",)
+    return names
 
 
 @dataclass(frozen=True)
@@ -89,5 +107,6 @@ class TrainingOptions:
                 raise UserError(f"{name} is {getattr(self, name)}; valid: 0 or more")
         choose("state_model", self.state_model, list(STATE_MODELS))
         choose("device", self.device, DEVICES)
+        ContextLayout(self.lags, self.clock)  # refuses what a context cannot hold
         if not 0 <= self.seed < 2**31:
             raise UserError(f"seed is {self.seed}; valid: 0 to {2**31 - 1}")

@@ -161,9 +161,10 @@ def readme(checkpoint: Checkpoint, title: str, path: Path) -> str:
         f"    {training['command']}",
         "",
         f"Dataset `{checkpoint.dataset}`, SHA-256 `{checkpoint.dataset_checksum}`. {training['fitted_trials']} trials "
-        f"fitted; of {len(metrics['test_seeds'])} seeds, seed {training['chosen']} was chosen on {len(held)} held-out "
-        "training trials.",
+        "fitted.",
     ]
+    if any(scores):
+        lines += [f"Of {len(scores)}, seed {training['chosen']} was best on {len(held)} held-out training trial(s)."]
     if checkpoint.own_models and not training["options"]["joint_held_out"]:
         lines += ["v4 is fitted to the held-out trials, too, and not chosen among the seeds."]
     lines += [

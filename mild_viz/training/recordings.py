@@ -19,14 +19,11 @@ STILL = 1e-9
 def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:
     """Windows to learn from; the partner is the robot with `joint_names`, or the second human if None.
 
-    A lost observation (NaN) of a person is a gap, which is bridged or left out; anything else that is not a number is
-    an error.
+    A lost observation (NaN) of a person is a gap, which is bridged or left out.
 
     Raises:
-        UserError: naming the trial and frame, or the action, that cannot be learnt from.
+        UserError: naming the action that cannot be learnt from, or the partner that never moves.
     """
-    for trial in trials:
-        _check_trial(trial)
     data = stack_windows(trials, joint_names)
     usable = complete_rows(data)
     whole = set(usable.trial.tolist())
@@ -42,7 +39,8 @@ def training_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None)
     return data
 
 
-def _check_trial(trial: Trial) -> None:
+def check_trial(trial: Trial) -> None:
+    """Refuse a trial that is too short, or that holds what is no number, naming it and the frame."""
     if trial.n_frames < MIN_FRAMES:
         raise UserError(
             f"trial {trial.name} has {trial.n_frames} frames, which is less than two windows; expected at least "

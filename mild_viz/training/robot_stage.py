@@ -80,7 +80,9 @@ def train_robot_stage(
         if human.partner_vae is not human.vae:
             net.load(human.partner_vae, m)
         elif init is not None and variant.name in init.robot_vaes:
-            net.load(init.robot_vaes[variant.name], m)
+            start = init.robot_vaes[variant.name]
+            if start.input_size == usable.partner.shape[1]:
+                net.load(start, m)
     net = net.to(device)
     x = net.standardise(torch.tensor(usable.partner, dtype=torch.float32, device=device))
     prior = StatePriors([human.hmms for _, human in table], usable, slice(size, 2 * size), device=device)

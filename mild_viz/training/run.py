@@ -18,18 +18,16 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.robot.robots import ROBOTS, robot_of
-from mild_viz.settings import VARIANTS, choose
+from mild_viz.settings import VARIANTS
 from mild_viz.training.human_stage import HumanModel, train_human_stage
 from mild_viz.training.joint_stage import train_joint_stage
-from mild_viz.training.options import TrainingOptions
+from mild_viz.training.options import TrainingOptions, stage_variants
 from mild_viz.training.outcome import Candidate, Made, save_best
 from mild_viz.training.progress import HeldOut, shown
-from mild_viz.training.recordings import training_windows
+from mild_viz.training.recordings import check_trial, training_windows
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
 from mild_viz.trial import Dataset, Trial
-
-STAGES = ("hhi", "hri")
 
 
 def hold_out(trials: Sequence[Trial], n_held: int, fold: int = -1) -> tuple[list[Trial], list[Trial]]:
@@ -103,14 +101,16 @@ def plan_run(
         UserError: on an unknown name, recordings that lack what the stage needs or that differ among themselves, or an
             `init` of other sizes.
     """
-    choose("stage", stage, STAGES)
-    variants = tuple(dict.fromkeys(choose("variant", name, list(VARIANTS)) for name in variants))
-    if not variants:
-        raise UserError(f"no variant is given; valid: {', '.join(VARIANTS)}")
+    variants = stage_variants(stage, variants)
     if options.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device 'cuda' is not here: torch finds no GPU that it can use; valid here: cpu")
     source = load_dataset(dataset)
-    rates = sorted({trial.rate for trial in source.train})
+    for trial in source.train + source.test:
+        check_trial(trial)
+    known = {trial.action for trial in source.train}
+    if not any(trial.action in known for trial in source.test):
+        raise UserError(f"dataset '{dataset}' has no test trial of {', '.join(sorted(known))}; expected one or more")
+    rates = sorted({trial.rate for trial in source.train + source.test})
     if len(rates) > 1:
         raise UserError(f"dataset '{dataset}' has trials of different rates: {rates} Hz; expected one rate")
     if stage == "hhi" and source.train[0].partner_arm is None:
@@ -118,8 +118,6 @@ def plan_run(
     robot = None
     if stage == "hri":
         robot = robot_interface(dataset)
-    else:  # a human-human model is v1 by construction: its one VAE serves both, and no robot VAE is trained
-        variants = tuple(name for name in variants if VARIANTS[name].own_models or name == "v1") or ("v1",)
     start = None if init is None else load_checkpoint(init)
     if start is not None:
         for name in ("hidden", "latent_size"):
@@ -162,6 +160,12 @@ def train(
     unseen = [name for name in plan.source.actions if all(trial.action != name for trial in plan.source.train)]
     if unseen and not quiet:
         print(f"note: no training trial shows {', '.join(unseen)}: the model will not know it", file=sys.stderr)
+    if plan.init is not None and plan.init.rate not in (None, plan.rate) and not quiet:
+        print(
+            f"note: {init} was trained at {plan.init.rate:g} Hz, these recordings have {plan.rate:g} Hz: velocities "
+            "have another scale",
+            file=sys.stderr,
+        )
     command = command or shlex.join(["mild-viz", "train", "--dataset", dataset, "--stage", stage, "--out", str(out)])
     description = {
         "dataset": dataset,

@@ -14,7 +14,7 @@ from mild_viz.data.load import check_name
 from mild_viz.errors import UserError
 from mild_viz.settings import VARIANTS, choose
 from mild_viz.training.config import OPTIONS, check_keys, converted, make_options, read_toml
-from mild_viz.training.options import TrainingOptions
+from mild_viz.training.options import TrainingOptions, stage_variants
 
 READABLE = 100
 """Characters of a cell's name before its hash: the names of files made from it must fit a file system."""
@@ -75,7 +75,8 @@ class SweepConfig:
         cells = []
         for dataset, variants, values in combinations:
             options = TrainingOptions(**{**self.options, **dict(zip(self.grid, values, strict=True))})
-            cells += [Cell(dataset, self.stage, variants, replace(options, seed=seed)) for seed in self.seeds]
+            trained = stage_variants(self.stage, variants)
+            cells += [Cell(dataset, self.stage, trained, replace(options, seed=seed)) for seed in self.seeds]
         return list(dict.fromkeys(cells))
 
 

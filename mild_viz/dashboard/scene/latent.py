@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from mild_viz.dashboard.scene.labels import CAPTION, TICK, add_label, add_title
 from mild_viz.dashboard.scene.layout import PLOT_SIZE, PLOT_TURN, VIEWER, Layout, picture_axes
 from mild_viz.dashboard.scene.palette import Palette, linear, state_color
-from mild_viz.dashboard.scene.projection import Projection, make_projection
+from mild_viz.dashboard.scene.projection import Projection, magnified, make_projection
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.rollout import Inference
 
@@ -52,10 +52,13 @@ class LatentFrames:
     """Whether the state is ever active; only these are named."""
     opacity: Float[np.ndarray, "N S"]
     projection: Projection
+    magnification: float
+    """How often the robot's latents are enlarged (`projection.magnified`)."""
 
 
 def latent_frames(inference: Inference, view: ViewSettings) -> LatentFrames:
     """Project everything once for the whole rollout."""
+    inference, magnification = magnified(inference)
     projection = make_projection(inference, view.latent_axes)
     latent = {
         "human": inference.human_latent_mean,
@@ -82,6 +85,7 @@ def latent_frames(inference: Inference, view: ViewSettings) -> LatentFrames:
         # Two digits: a change that nobody sees sends nothing.
         opacity=np.round(OPACITY_FLOOR + OPACITY_RANGE * alpha, 2),
         projection=projection,
+        magnification=magnification,
     )
 
 
@@ -114,7 +118,7 @@ class LatentView:
         self._frame.wxyz = np.array([np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)])
         if drawn[0] is frames and drawn[1] is colors:
             return
-        self._draw_box(frames.projection, colors, frames.known["truth"])
+        self._draw_box(frames, colors)
         self._draw_traces(frames, colors)
         self._draw_states(frames)
 
@@ -136,7 +140,8 @@ class LatentView:
             for handle, value in zip(self._ellipsoids[agent], opacity, strict=True):
                 handle.opacity = value
 
-    def _draw_box(self, projection: Projection, colors: Palette, truth: bool) -> None:
+    def _draw_box(self, frames: LatentFrames, colors: Palette) -> None:
+        projection, truth = frames.projection, frames.known["truth"]
         step, ticks = projection.ticks()
         lines = [grid_lines(ticks), box_edges()]
         tints = [np.tile(colors.grid_section, (len(lines[0]), 2, 1)), np.tile(colors.frame, (len(lines[1]), 2, 1))]
@@ -147,7 +152,10 @@ class LatentView:
         for handle, text, spot in zip(self._axis_labels, projection.labels, spots, strict=True):
             handle.text, handle.position = text, spot
         self._title.position = self._caption.position = (0.0, 0.0, HALF + 0.16)
-        self._caption.text = f"human red, {'true robot blue, ' if truth else ''}predicted dashed · grid {step:g}"
+        enlarged = f", robot ×{frames.magnification:g}" if frames.magnification > 1.0 else ""
+        self._caption.text = (
+            f"human red, {'true robot blue, ' if truth else ''}predicted dashed · grid {step:g}{enlarged}"
+        )
 
     def _draw_traces(self, frames: LatentFrames, colors: Palette) -> None:
         tints = {"human": colors.human, "truth": colors.robot, "prediction": colors.dashes}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -63,6 +63,29 @@ class Projection:
         return step, lines
 
 
+def magnified(inference: Inference) -> tuple[Inference, float]:
+    """The robot's latents enlarged about their middle until they spread about as far as the human's, and how often.
+
+    The two live in latent spaces of their own, so that their spreads need not agree (in v4 the human's is up to
+    fifteen times wider, and the robot would be a dot). A spread of a similar size is left alone.
+    """
+    human, robot = (
+        # The Gaussians count too: enlarged ones must not hide the human's.
+        np.sqrt(finite(latent).var(0).sum() + np.trace(covariances, axis1=1, axis2=2).mean())
+        for latent, covariances in (
+            (inference.human_latent_mean, inference.human_state_covariances),
+            (inference.robot_latent_mean, inference.robot_state_covariances),
+        )
+    )
+    ratio = float(human / max(robot, 1e-9))
+    factor = min(nice_step(ratio), 100.0) if ratio >= 3.0 else 1.0
+    middle = inference.robot_state_means.mean(0)
+    names = ("robot_latent_mean", "robot_latent_truth", "robot_state_means")
+    changes = {name: middle + factor * (getattr(inference, name) - middle) for name in names}
+    covariances = factor**2 * inference.robot_state_covariances
+    return (inference if factor == 1.0 else replace(inference, **changes, robot_state_covariances=covariances)), factor
+
+
 def make_projection(inference: Inference, axes: tuple[int, int, int] | str) -> Projection:
     """Three latent dimensions, or the three principal components, scaled so that everything fits the box.
 
@@ -71,8 +94,7 @@ def make_projection(inference: Inference, axes: tuple[int, int, int] | str) -> P
     """
     means = np.concatenate([inference.human_state_means, inference.robot_state_means])
     latent = finite(np.concatenate([inference.human_latent_mean, inference.robot_latent_truth]))
-    everything = finite(np.concatenate([latent, inference.robot_latent_mean, means]))
-    n_dimensions = everything.shape[1]
+    n_dimensions = means.shape[1]
     if isinstance(axes, str):
         basis, shares = principal_components(np.concatenate([latent, means]))
         labels = tuple(f"PC{i + 1} · {share:.0%}" for i, share in enumerate(shares))
@@ -80,7 +102,11 @@ def make_projection(inference: Inference, axes: tuple[int, int, int] | str) -> P
         if max(axes) >= n_dimensions:
             raise UserError(f"latent dimension {max(axes)} does not exist; valid: 0 to {n_dimensions - 1}")
         basis, labels = np.eye(n_dimensions)[list(axes)], tuple(f"z{axis}" for axis in axes)
-    low, high = extent(everything @ basis.T)
+    # Each agent by its own quartiles: beside a robot that hardly moves, the human's whole way would be an outlier.
+    human = finite(np.concatenate([inference.human_latent_mean, inference.human_state_means]))
+    robot = np.concatenate([inference.robot_latent_truth, inference.robot_latent_mean, inference.robot_state_means])
+    extents = np.array([extent(points @ basis.T) for points in (human, finite(robot))])
+    low, high = extents[:, 0].min(0), extents[:, 1].max(0)
     half = np.maximum(0.5 * (high - low), FLATTEST * 0.5 * float((high - low).max())) * 1.06
     middle = 0.5 * (low + high)
     scale = 0.5 * PLOT_SIZE / half

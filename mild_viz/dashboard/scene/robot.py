@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from mild_viz.dashboard.scene.labels import add_title
 from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.dashboard.scene.shapes import rotate
+from mild_viz.robot.robots import robot_title
 from mild_viz.rollout import Rollout
 
 ROOT = "/robot"
@@ -54,7 +55,7 @@ class RobotView:
     ) -> None:
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
         self._ghost_frame = server.scene.add_frame(f"{ROOT}/ghost", show_axes=False)
-        self._title, self._caption = add_title(server, ROOT, f"Robot: {name[:1].upper()}{name[1:]}")
+        self._title, self._caption = add_title(server, ROOT, f"Robot: {robot_title(name)}")
         self._visuals = {i: visuals[link] for i, link in enumerate(link_names) if link in visuals}
         self._solid = {
             i: server.scene.add_mesh_trimesh(

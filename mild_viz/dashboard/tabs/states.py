@@ -71,7 +71,7 @@ class StatesTab:
 
     def compare(self, ticked: frozenset[int], stored: frozenset[int], action: str, model: str) -> None:
         """Say whether the ticked states are what the model has stored; only if not, there is something to save."""
-        names = ", ".join(str(state) for state in sorted(stored)) or "none"
+        names = ", ".join(str(state) for state in sorted(stored)) or "no contact states"
         self.save.disabled = ticked == stored
         if ticked == stored:
             self.say_saved(f"Saved: {names} for {action}, the default of model {model}.")
@@ -82,12 +82,19 @@ class StatesTab:
         set_content(self._saved, f'<div class="mv-note">{escape(text)}</div>')
 
     def show(self, rollout: Rollout) -> None:
-        """Write how long and how often each state is active in this trial."""
-        action = rollout.inference.action
-        if action in CONTACT_ACTIONS:
-            text = f"States of contact in <b>{escape(action)}</b>: there mild-ik goes for the hand."
+        """Write how long and how often each state is active in this trial, and what a tick does."""
+        inference = rollout.inference
+        action = f"<b>{escape(inference.action)}</b>"
+        if inference.action not in CONTACT_ACTIONS:
+            text = f"A {action} has no contact; in a ticked state mild-ik would go for the hand."
+        elif rollout.contact_states:
+            text = f"States of contact in {action}, {inference.variant}: there mild-ik goes for the hand."
         else:
-            text = f"A <b>{escape(action)}</b> has no contact; in a ticked state mild-ik would go for the hand."
+            text = (
+                f"No state of {action}, {inference.variant}, is marked as contact: mild-ik moves the robot as decoded. "
+                "Tick the states in which the hands meet, and it goes for the hand there. (Recordings such as yumi's "
+                "do not tell where the hands met.)"
+            )
         set_content(self._intro, f'<div class="mv-note">{text} Mean visit and share of this trial:</div>')
         for state in range(rollout.inference.n_states):
             length, share = rollout.state_durations[state], rollout.state_occupancy[state]

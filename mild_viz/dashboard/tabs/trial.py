@@ -40,7 +40,7 @@ class TrialTab:
         )  # fmt: skip
         self._variant = gui.add_dropdown(
             "Variant", checkpoint.variants, initial_value=first.variant,
-            hint="How the robot's decoder was trained and how it is conditioned on the human (the paper's table).",
+            hint="How it was trained and conditioned: v1 to v3.2 as in the paper; v4 is ours, with states of its own.",
         )  # fmt: skip
         self._note = gui.add_html("")
         self._others = gui.add_html("")
@@ -85,6 +85,8 @@ class TrialTab:
         inference = rollout.inference
         variant = VARIANTS[inference.variant]
         text = escape(f"{variant.name}: {variant.summary}.")
+        if variant.own_models:
+            text += " Not of the paper. It has its own states and contact states; the first of its models is drawn."
         if variant.posterior_covariance:
             posterior, states = (
                 float(np.sqrt(np.nanmean(np.diagonal(covariance, axis1=1, axis2=2))))

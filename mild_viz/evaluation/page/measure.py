@@ -18,6 +18,7 @@ from mild_viz.evaluation.report import Evaluation, measure
 from mild_viz.evaluation.segmentation import PhaseFit, Segmentation, phase_fit, segmentation
 from mild_viz.pairs import stack_windows
 from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.settings import VARIANTS
 from mild_viz.trial import Dataset
 
 SEED = 0
@@ -137,7 +138,8 @@ def _measure_variant(
     rng = np.random.default_rng(SEED)
     measured = {action: calibration(some, rng) for action, some in passes.items()}
     used = {action: segmentation(some) for action, some in passes.items()}
-    floor = dict(checkpoint.training.get("options") or {}).get("covariance_floor")
+    own = variant in VARIANTS and VARIANTS[variant].own_models
+    floor = dict(checkpoint.training.get("options") or {}).get("joint_floor" if own else "covariance_floor")
     warnings: list[health.Warning] = []
     for action, one in measured.items():
         if checkpoint.dataset == dataset.name and action in training:

@@ -53,7 +53,7 @@ def train_buetepage(
     if epochs is not None:
         options = replace(options, epochs=epochs)
     check_checkpoint_target(out)
-    plan = plan_run(dataset, "hri", ("v1",), TrainingOptions(seeds=seeds, seed=seed))
+    plan = plan_run(dataset, "hhi" if human_human else "hri", ("v1",), TrainingOptions(seeds=seeds, seed=seed))
     source, fit, held, robot = plan.source, plan.fit, plan.held, None if human_human else plan.robot
     actions = tuple(action for action in source.actions if any(trial.action == action for trial in fit))
     started = time.monotonic()
