@@ -75,8 +75,7 @@ class ArmChain:
         The links bound it; where bends or limits keep an arm from that, it is the largest distance that IK towards
         far points in many directions finds.
         """
-        from mild_viz.robot.kernels import solve_ik_batch
-        from mild_viz.robot.kinematics.kernels import kinematics_batch
+        from mild_viz.robot.ik import forward, solve_ik  # they take a chain
 
         rng = np.random.default_rng(0)
         away = rng.normal(size=(REACH_STARTS, 3))
@@ -84,8 +83,8 @@ class ArmChain:
         starts = rng.uniform(
             np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi), (REACH_STARTS, self.n_joints)
         )
-        stretched = solve_ik_batch(self.arm, self.shoulder + away, starts, 1.0, 0.0)
-        distances = np.linalg.norm(kinematics_batch(self.arm, stretched)[0] - self.shoulder, axis=1)
+        stretched = solve_ik(self, self.shoulder + away, starts, 1.0, 0.0)
+        distances = np.linalg.norm(forward(self, stretched) - self.shoulder, axis=1)
         return float(distances.max())
 
 
