@@ -43,7 +43,7 @@ SHARED = {f"{side}_{link}": f"../panda/meshes/{link}.ply" for side in ARMS for l
 def links() -> dict[str, list[Piece]]:
     """The stand: a foot on the floor, a column, and the beam that carries both arms."""
     foot = slab(0.46, 0.40, rim(0.03, 0.08, 0.012), 0.06, DARK, 6)
-    column = lathe([(0.0, 0.07), (0.105, 0.07), (0.085, 0.15), (0.085, HEIGHT - 0.10), (0.12, HEIGHT - 0.05),
+    column = lathe([(0.0, 0.07), (0.105, 0.07), (0.085, 0.15), (0.085, HEIGHT - 0.10), (0.108, HEIGHT - 0.05),
                     (0.0, HEIGHT - 0.05)], LIGHT, 40, 0.01)  # fmt: skip
     ring = band(0.0865, 0.40, 0.41, LED, 40)
     beam = slab(2.0 * APART + 0.26, 0.22, rim(HEIGHT - 0.06, HEIGHT - 0.012, 0.010), 0.03, GREY, 6)
