@@ -45,6 +45,19 @@ class Skeleton:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectTrack:
+    """Pose over time of an object that is handed over, in the human's own frame; NaN where it was not tracked."""
+
+    positions: Float[np.ndarray, "T 3"]
+    """The tracked point of the object [m]."""
+    wxyzs: Float[np.ndarray, "T 4"]
+    """Unit quaternions: the object's own frame in the human's."""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, eq=False)
 class Trial:
     """One recorded interaction of a human with a partner (a second human, or a robot).
 
@@ -69,6 +82,8 @@ class Trial:
     T_world_human: Float[np.ndarray, "4 4"] | None = None
     """Pose of the human's own frame in one world frame; None where each person was recorded apart."""
     T_world_partner: Float[np.ndarray, "4 4"] | None = None
+    object_track: ObjectTrack | None = None
+    """What is handed over, where it was recorded."""
     phase: Int[np.ndarray, " T"] | None = None
     """True phase of every frame (index into `PHASES`), where it is known."""
     active: Int[np.ndarray, " T"] | None = None
@@ -82,6 +97,11 @@ class Trial:
             value = getattr(self, label)
             if value is not None and len(value) != n_frames:
                 raise UserError(f"trial {self.name}: {label} has {len(value)} frames, human_arm has {n_frames}")
+        if self.object_track is not None and len(self.object_track.positions) != n_frames:
+            raise UserError(
+                f"trial {self.name}: object_track has {len(self.object_track.positions)} frames, "
+                f"human_arm has {n_frames}"
+            )
         freeze_arrays(self)
 
     @property
