@@ -65,6 +65,11 @@ class Checkpoint:
         return shared + tuple(self.own_models)
 
     @property
+    def default_variant(self) -> str:
+        """What is run where none is chosen: v3.1, else the first."""
+        return "v3.1" if "v3.1" in self.variants else self.variants[0]
+
+    @property
     def actions(self) -> tuple[str, ...]:
         return tuple(self.hmms)
 
