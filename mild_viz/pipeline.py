@@ -112,7 +112,7 @@ def control(
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
     transition = checkpoint.transition_state_of(inference.variant, inference.action)
-    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
+    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement_for(robot.chain))
     target = in_frame(placed.T_world_human, inference.human_hand)
     result = run_controller(
         robot.chain,
