@@ -129,8 +129,11 @@ def _check_object(
     wrong = np.flatnonzero(np.abs(length - 1.0) > 1e-3)  # a gap is NaN, and not wrong
     if len(wrong):
         raise UserError(
-            f"{path}: object_quaternion of frame {wrong[0]} has length {length[wrong[0]]:.3g}; expected unit quaternions"
+            f"{path}: object_quaternion of frame {wrong[0]} has length {length[wrong[0]]:.3g}; "
+            "expected unit quaternions"
         )
+    from scipy.spatial.transform import Rotation  # slow to import, and only this source needs it
+
     rotation = np.full((n_frames, 3, 3), np.nan)
     known = np.isfinite(wxyz).all(axis=1)
     rotation[known] = Rotation.from_quat(wxyz[known][:, [1, 2, 3, 0]]).as_matrix()
@@ -142,9 +145,11 @@ def _own_track(
     T_world_human: Float[np.ndarray, "4 4"], positions: Float[np.ndarray, "T 3"], rotations: Float[np.ndarray, "T 3 3"]
 ) -> ObjectTrack:
     """The object in the human's own frame."""
+    from scipy.spatial.transform import Rotation
+
     wxyzs = np.full((len(positions), 4), np.nan)
     known = np.isfinite(rotations).all(axis=(1, 2))
-    wxyzs[known] = quaternions(T_world_human[:3, :3].T @ rotations[known])
+    wxyzs[known] = Rotation.from_matrix(T_world_human[:3, :3].T @ rotations[known]).as_quat()[:, [3, 0, 1, 2]]
     return ObjectTrack(to_frame(T_world_human, positions), wxyzs)
 
 
