@@ -20,13 +20,14 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_rate, window_errors
 from mild_viz.prediction import predict
-from mild_viz.robot.contact import in_frame
+from mild_viz.robot.carried import carry_object
+from mild_viz.robot.contact import in_frame, transfer_frame
 from mild_viz.robot.controller import initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import WINDOW, ControlSettings
-from mild_viz.trial import Skeleton, Trial
+from mild_viz.trial import ObjectTrack, Skeleton, Trial
 
 NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
@@ -58,6 +59,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
 
     newest = slice(NEWEST, NEWEST + n_windows)
     first = slice(WINDOW, WINDOW + n_windows)
+    transfer = transfer_frame(trial)
     return Inference(
         dataset=trial.dataset,
         split=trial.split,
@@ -89,6 +91,9 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         human_arm=trial.human_arm[newest],
         human_hand=arm[newest, 2],
         human_skeleton=_rows_of(trial.human_skeleton, newest),
+        partner_skeleton=_rows_of(_partner_seen_by_human(trial), newest),
+        object_track=None if trial.object_track is None else _track_rows(trial.object_track, newest),
+        handed_over=None if transfer is None else int(np.clip(transfer - NEWEST, 0, n_windows - 1)),
         phase=None if trial.phase is None else trial.phase[newest],
         decodes=decoding.decodes,
         partner_decoded=moved.partner,
@@ -125,6 +130,11 @@ def control(
         inference.log_transition if uses_transition(settings, transition) else None,
     )
     end_effector = robot.end_effector(result.joints)
+    link_poses = robot.link_poses(result.joints, inference.action)
+    carried = None
+    if inference.object_track is not None and inference.handed_over is not None:
+        hand = link_poses[:, robot.hand_link, :4]
+        carried = carry_object(inference.object_track, inference.handed_over, placed.T_world_human, end_effector, hand)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
         inference=inference,
@@ -139,12 +149,14 @@ def control(
         stiffness=result.stiffness,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
-        link_poses=robot.link_poses(result.joints, inference.action),
+        link_poses=link_poses,
         link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action),
         state_durations=durations,
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),
         placement=placed.placement,
+        object_poses=None if carried is None else carried.poses,
+        object_by_robot=None if carried is None else carried.by_robot,
     )
 
 
@@ -177,3 +189,17 @@ def state_visits(
 
 def _rows_of(skeleton: Skeleton | None, rows: slice) -> Skeleton | None:
     return None if skeleton is None else Skeleton(skeleton.joint_names, skeleton.bones, skeleton.positions[rows])
+
+
+def _track_rows(track: ObjectTrack, rows: slice) -> ObjectTrack:
+    return ObjectTrack(track.positions[rows], track.wxyzs[rows])
+
+
+def _partner_seen_by_human(trial: Trial) -> Skeleton | None:
+    """The partner's whole body in the human's frame; None where it, or one common world frame, was not recorded."""
+    body, T_world_human, T_world_partner = trial.partner_skeleton, trial.T_world_human, trial.T_world_partner
+    if body is None or T_world_human is None or T_world_partner is None:
+        return None
+    T_human_partner = np.linalg.inv(T_world_human) @ T_world_partner
+    points = in_frame(T_human_partner, body.positions.reshape(-1, 3))
+    return Skeleton(body.joint_names, body.bones, points.reshape(body.positions.shape))

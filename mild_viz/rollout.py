@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from mild_viz.files import write_atomically
 from mild_viz.settings import Placement
-from mild_viz.trial import Skeleton, freeze_arrays
+from mild_viz.trial import ObjectTrack, Skeleton, freeze_arrays
 
 SAVED = (
     "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state", "log_transition",
@@ -76,6 +76,12 @@ class Inference:
     """The wrist as the controller sees it: gaps filled by the last observation."""
     human_skeleton: Skeleton | None = None
     """The whole body at the newest observations, human frame, where it was recorded."""
+    partner_skeleton: Skeleton | None = None
+    """The recorded partner's whole body at the newest observations, in the human's frame; None where unknown."""
+    object_track: ObjectTrack | None = None
+    """What is handed over, as recorded, in the human's frame."""
+    handed_over: int | None = None
+    """The row in which the recorded hands are nearest, where there is an object."""
     phase: Int[np.ndarray, " N"] | None = None
     decodes: str = "joints"
     """What the model decodes of the partner: a key of `ERROR_UNITS`."""
@@ -136,6 +142,10 @@ class Rollout:
     contact_states: frozenset[int]
     placement: Placement
     """Where the human stands, and in words for the page where that comes from."""
+    object_poses: Float[np.ndarray, "N 7"] | None = None
+    """Pose in world of the object that is handed over: wxyz, xyz [m]; None without one, NaN where unknown."""
+    object_by_robot: Bool[np.ndarray, " N"] | None = None
+    """Whether the robot holds the object; else it is drawn as recorded."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

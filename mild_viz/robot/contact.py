@@ -57,6 +57,19 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     return seen & (extension >= EXTENDED * largest) & (speed < TOGETHER)
 
 
+def transfer_frame(trial: Trial) -> int | None:
+    """The frame in which the two right wrists are nearest: when an object changes hands.
+
+    None without an object, and where the two people were not recorded in one world frame.
+    """
+    partner, T_world_human, T_world_partner = trial.partner_arm, trial.T_world_human, trial.T_world_partner
+    if trial.object_track is None or partner is None or T_world_human is None or T_world_partner is None:
+        return None
+    gap = in_frame(T_world_human, trial.human_arm[:, 2]) - in_frame(T_world_partner, partner[:, 2])
+    distance = np.linalg.norm(gap, axis=1)
+    return int(np.nanargmin(distance)) if np.isfinite(distance).any() else None
+
+
 def suggest_contact_states(
     active: Sequence[Int[np.ndarray, "_"]], touching: Sequence[Bool[np.ndarray, "_"]], n_states: int
 ) -> frozenset[int]:
