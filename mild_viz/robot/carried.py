@@ -11,7 +11,7 @@ from mild_viz.robot.contact import in_frame
 from mild_viz.trial import ObjectTrack, freeze_arrays
 
 OBJECT_LENGTH = 0.27
-"""How far the object reaches below its tracked point [m]: to where the recorded givers hold it; its shape is unknown."""
+"""How far the object reaches below its tracked point [m]: to where recorded givers hold it; its shape is unknown."""
 
 
 @dataclass(frozen=True, eq=False)

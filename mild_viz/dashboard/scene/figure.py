@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +17,9 @@ ARM = ("right_shoulder", "right_elbow", "right_wrist")
 
 FACE = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")
 """Tracked points of the head that are drawn as small dots, without bones."""
+
+WALK = 0.6
+"""Who moves the head by more than this [m] walks."""
 
 ARM_RADII = (0.050, 0.041, 0.046)
 ARM_BONE_RADII = (0.040, 0.033)
@@ -48,6 +52,16 @@ class Figure:
         """The middle of the shoulders, over the rollout."""
         return np.median(self.torso_poses[:, 4:], axis=0)
 
+    @cached_property
+    def steps(self) -> Float[np.ndarray, "N 3"]:
+        """How far the head is from where it mostly is, in every frame [m]."""
+        return self.head_positions - np.median(self.head_positions, axis=0)
+
+    @cached_property
+    def walks(self) -> bool:
+        """Whether the person leaves the place."""
+        return float(np.ptp(self.head_positions, axis=0).max()) > WALK
+
     @property
     def crown(self) -> Float[np.ndarray, " 3"]:
         """The top of the head, over the rollout."""
@@ -63,6 +77,15 @@ def make_figure(inference: Inference) -> Figure:
     if skeleton is None or not set(ARM) <= set(skeleton.joint_names):
         return arm_figure(inference.human_arm, height)
     return skeleton_figure(skeleton, height)
+
+
+def make_giver(inference: Inference) -> Figure | None:
+    """The recorded giver's body in the human's frame; None where nothing is handed over or the body is unknown."""
+    skeleton = inference.partner_skeleton
+    if inference.object_track is None or skeleton is None or not set(ARM) <= set(skeleton.joint_names):
+        return None
+    arm = skeleton.positions[:, [skeleton.joint_names.index(name) for name in ARM]]
+    return skeleton_figure(skeleton, body.stature(arm))
 
 
 def arm_figure(arm: Float[np.ndarray, "N 3 3"], height: float) -> Figure:

@@ -1,4 +1,4 @@
-"""Light, floor, and the pedestal that lifts the robot to a standing person."""
+"""Light, floor, and the pedestal or stand that lifts the robot to a standing person."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import viser
 
 from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.dashboard.scene.shapes import Mesh, loft
+
+LOWEST_STAND = 0.4
+"""From this height on [m] a robot is on a slim stand: a podium would hide who is behind it."""
 
 LOWEST_PEDESTAL = 0.03
 """A smaller step between floor and robot [m] is not worth a pedestal."""
@@ -59,8 +62,14 @@ def light(server: viser.ViserServer) -> None:
 
 
 def pedestal(floor: float, top: float) -> Mesh:
-    """A round podium with a softened edge [m]."""
+    """A round podium with a softened edge, or a plate on a column with a foot where it is high [m]."""
     edge = 0.012
+    if top - floor > LOWEST_STAND:
+        column = 0.055
+        z = np.array([0.0, 0.012, 0.03, 0.05, top - floor - 0.07, top - floor - 0.04, top - floor - edge, top - floor])
+        radius = np.array([0.27, 0.27, 0.25, column, column, 0.17, 0.18, 0.18 - edge])
+        zero = np.zeros_like(z)
+        return loft(np.stack([z + floor, radius, radius, zero, zero], 1), sides=72)
     radius = np.array([0.345, 0.345, 0.345 - edge])
     z = np.array([floor, top - edge, top])
     zero = np.zeros(3)

@@ -27,6 +27,12 @@ FIELD_OF_VIEW = np.radians(28.0)
 WIDEST = 1.85
 """Width over height of a canvas that just shows all three groups; one that is wider needs no more distance."""
 
+STEP = 0.2
+"""How much lower than where they mostly stand the recorded feet of one who walks come [m]."""
+
+CAPTION_REACH = 1.15
+"""Half of the width of the plot's caption, seen from where the way of one who walks fits the picture [m]."""
+
 TITLE_GAP, TITLE_STEP = 0.13, 0.23
 """From a head to its title, and from the human's title up to the robot's [m]."""
 
@@ -51,6 +57,8 @@ class Layout:
     robot_top: Vector
     human_top: Vector
     """The crowns of both heads."""
+    walk: Float[np.ndarray, "K 3"]
+    """Where else the human's crown comes: the corners of the way of one who walks."""
     human_eye: Vector
     hand: Vector
     """Where the hands are at their nearest."""
@@ -83,18 +91,28 @@ class Layout:
 def make_layout(
     robot_top: Vector,
     human_top: Vector,
+    human_tops: Float[np.ndarray, "N 3"],
     human_eye: Vector,
     hand: Vector,
     floor: float,
+    forward: Vector | None = None,
 ) -> Layout:
-    """The layout of a dyad: the plot stands beyond the human, a little turned towards the dyad's viewer."""
+    """The layout of a dyad: the plot stands beyond the human, a little turned towards the dyad's viewer.
+
+    `human_tops` is everywhere that the human's crown comes, `human_top` where it mostly is. The layout is along
+    `forward`, or else from the robot to the human.
+    """
     away = human_top * [1.0, 1.0, 0.0]  # not where the human's frame is: one who walks leaves it behind
     distance = float(np.linalg.norm(away))
-    forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
-    centre = forward * (max(distance, 0.75) + 1.40)
+    if forward is None:
+        forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
+    side = np.array([forward[1], -forward[0], 0.0])
+    along, across = human_tops @ forward, human_tops @ side
+    walk = np.unique([human_tops[i] for v in (along, across) for i in (v.argmin(), v.argmax())], axis=0)
+    centre = forward * (max(float(along.max()), 0.75) + 1.40)
     centre[2] = floor + 0.98
     yaw = float(np.arctan2(forward[1], forward[0])) + PLOT_TURN
-    return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
+    return Layout(forward, robot_top, human_top, walk, human_eye, hand, floor, centre, yaw)
 
 
 def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 0.0) -> Camera:
@@ -104,14 +122,18 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
     if name == "participant":
         return over_shoulder(layout, aspect)
     plot = plot_points(layout) + [layout.plot_title + (0.12 + headroom) * up]
+    if len(layout.walk) > 1:  # from so far away the caption is wider than the box below it
+        plot.append(layout.plot_title + CAPTION_REACH * layout.forward)
     if name == "latent":
         direction = layout.side - 0.30 * layout.forward + 0.20 * up  # across the box, with a gap before the dyad
         return beside(layout.human_top, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
-    foot = layout.human_top * [1.0, 1.0, 0.0] + floor * up
     dyad = [layout.robot_title + (0.14 + headroom) * up - 0.5 * layout.forward]
     dyad += [layout.human_title + (0.14 + headroom) * up + 0.26 * layout.forward]
     dyad += [floor * up + 0.36 * (b * layout.side - layout.forward) for b in (-1, 1)]
-    dyad += [foot + 0.24 * (b * layout.side + layout.forward) for b in (-1, 1)]
+    for crown in layout.walk:
+        foot = crown * [1.0, 1.0, 0.0] + (floor - (STEP if len(layout.walk) > 1 else 0.0)) * up
+        dyad += [foot + 0.24 * (b * layout.side + a * layout.forward) for a in (-1, 1) for b in (-1, 1)]
+        dyad += [crown + (TITLE_GAP + 0.14 + headroom) * up + 0.42 * a * layout.forward for a in (-1, 1)]
     oblique = -0.55 * layout.forward + 0.38 * up if name == "experimenter" else 0.20 * up
     return fitted(np.array(dyad + plot), layout.side + oblique, aspect, margin=0.02)
 

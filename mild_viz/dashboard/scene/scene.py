@@ -10,10 +10,11 @@ import viser
 from jaxtyping import Float
 
 from mild_viz.dashboard.scene import body
+from mild_viz.dashboard.scene.carried import ObjectView
 from mild_viz.dashboard.scene.compared import ComparedView
-from mild_viz.dashboard.scene.figure import Figure, make_figure
+from mild_viz.dashboard.scene.figure import Figure, make_figure, make_giver
 from mild_viz.dashboard.scene.ground import GroundView
-from mild_viz.dashboard.scene.human import HumanView
+from mild_viz.dashboard.scene.human import GiverView, HumanView
 from mild_viz.dashboard.scene.latent import LatentFrames, LatentView, latent_frames
 from mild_viz.dashboard.scene.layout import CAMERAS, WIDEST, Camera, Layout, camera, make_layout
 from mild_viz.dashboard.scene.palette import palette
@@ -36,6 +37,7 @@ class Scene:
         self._rollout: Rollout | None = None
         self._view: ViewSettings | None = None
         self._figure: Figure | None = None
+        self._giver_figure: Figure | None = None
         self._latent_frames: LatentFrames | None = None
         self._layout: Layout | None = None
         self._frame = 0
@@ -43,6 +45,8 @@ class Scene:
         self._ground = GroundView(server)
         colors = palette(dark)
         self._human = HumanView(server, colors)
+        self._giver = GiverView(server, colors)
+        self._object = ObjectView(server, colors)
         self._robot = RobotView(server, robot.visuals, tuple(robot.link_names), robot.name)
         self._compared = ComparedView(server, robot.visuals, robot.link_names)
         self._volume = VolumeView(server, robot.chain)
@@ -62,9 +66,9 @@ class Scene:
         """
         inference = rollout.inference
         last = self._rollout.inference if self._rollout is not None else None
-        figure, frames = self._figure, self._latent_frames
+        figure, giver, frames = self._figure, self._giver_figure, self._latent_frames
         if figure is None or inference is not last:
-            figure = make_figure(inference)
+            figure, giver = make_figure(inference), make_giver(inference)
         if frames is None or inference is not last or latent_view(view) != latent_view(self._view):
             frames = latent_frames(inference, view)
         arms = robot_frames(rollout)
@@ -77,13 +81,15 @@ class Scene:
                 fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
             self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human, inference.tracked)
+            self._giver.show(giver, rollout.T_world_human, layout.floor, colors, view.show_giver)
+            self._object.show(rollout, colors, view.show_robot or view.show_human)
             ghost = view.ghost and not compared  # of too many arms none can be told apart
             self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, ghost)
             self._compared.show([one for one in compared if one.controller != rollout.controller], view.show_robot)
             self._volume.show(colors, view.show_reach and view.show_robot)
             self._reach.show(rollout, colors, view.show_human and view.show_robot)
             self._latent.show(frames, layout, colors, view.show_latent)
-            self._figure, self._latent_frames = figure, frames
+            self._figure, self._giver_figure, self._latent_frames = figure, giver, frames
             self._set_frame(min(self._frame, inference.n_windows - 1))
 
     def set_frame(self, n: int) -> None:
@@ -126,7 +132,9 @@ class Scene:
     def _set_frame(self, n: int) -> None:
         self._frame = n
         self._human.set_frame(n)
+        self._giver.set_frame(n)
         self._robot.set_frame(n)
+        self._object.set_frame(n)
         self._compared.set_frame(n)
         self._reach.set_frame(n)
         self._latent.set_frame(n)
@@ -168,12 +176,13 @@ def scene_layout(rollout: Rollout, figure: Figure, bounds: Float[np.ndarray, "2 
     T = rollout.T_world_human
     up = T[:3, :3].T @ [0.0, 0.0, 1.0]
     middle, height = figure.shoulders, figure.height
-    crown, eye, sole = (
-        T[:3, :3] @ point + T[:3, 3]
-        for point in (figure.crown, figure.crown - 0.07 * height * up, middle - body.COLLAR_SHARE * height * up)
-    )
+    crown, sole = (T[:3, :3] @ point + T[:3, 3] for point in (figure.crown, middle - body.COLLAR_SHARE * height * up))
     feet = float(sole[2]) if figure.soles is None else float((T[:3, :3] @ figure.soles + T[:3, 3])[2])
     distance = np.where(np.isfinite(rollout.hand_distance), rollout.hand_distance, np.inf)
     hand = np.nan_to_num(rollout.target[int(distance.argmin())])
     robot_top = np.array([0.0, 0.0, bounds[1, 2]])
-    return make_layout(robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet))
+    # One who walks is seen along the robot's own forward: what matters happens in front of it.
+    steps = figure.steps @ T[:3, :3].T if figure.walks else np.zeros((1, 3))
+    eye = crown - np.array([0.0, 0.0, 0.07 * height])
+    forward = np.array([1.0, 0.0, 0.0]) if figure.walks else None
+    return make_layout(robot_top, crown, crown + steps, eye, hand, min(float(bounds[0, 2]), feet), forward)
