@@ -44,6 +44,8 @@ class ArmChain:
     upper: Float[np.ndarray, " J"]
     rest: Float[np.ndarray, " J"]
     """Where the joints stand when nothing moves them [rad]."""
+    velocity: Float[np.ndarray, " J"]
+    """Largest speed of each joint [rad/s]; infinite where the description states none."""
     offsets: Float[np.ndarray, "_ 4 4"]
     axes: Float[np.ndarray, "J 3"]
 
@@ -135,8 +137,9 @@ def load_chain(
     values = description.values(rest)
     offsets, axes = _cached_fold(description, joint_names, end_effector, values)
     lower, upper = np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+    velocity = np.array([joint.velocity for joint in joints])
     resting = np.array([values[name] for name in joint_names])
-    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, offsets, axes)
+    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, velocity, offsets, axes)
 
 
 def cache_folder() -> Path:

@@ -55,6 +55,8 @@ class Joint:
     lower: float
     """Infinite where the file states no limit [rad or m]."""
     upper: float
+    velocity: float
+    """Largest speed [rad/s or m/s]; infinite where the file states none (0 says nothing either)."""
     mimic: tuple[str, float, float] | None
     """(joint, multiplier, offset) where this joint follows another one."""
 
@@ -220,11 +222,13 @@ def _convert(joint: yourdfpy.Joint) -> Joint:
         upper = upper if joint.limit.upper is None else float(joint.limit.upper)
         if not lower <= upper:
             raise ValueError(f"joint {joint.name} has the limits {lower} to {upper}")
+    stated = None if joint.limit is None else joint.limit.velocity
+    velocity = float(stated) if stated and float(stated) > 0.0 else np.inf
     mimic = None
     if joint.mimic is not None:
         multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
         mimic = (joint.mimic.joint or "", multiplier, float(joint.mimic.offset or 0.0))
-    return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, mimic)
+    return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, velocity, mimic)
 
 
 def _sort(path: Path, links: list[str], joints: list[Joint]) -> tuple[str, tuple[Joint, ...]]:
