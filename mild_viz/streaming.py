@@ -71,6 +71,8 @@ class Command(NamedTuple):
     log_alpha: Float[np.ndarray, " S"]
     log_transition: float
     active_state: int
+    human_latent_mean: Float[np.ndarray, " D"]
+    human_latent_std: Float[np.ndarray, " D"]
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
     joints_decoded: Float[np.ndarray, " J"]
@@ -109,7 +111,7 @@ def stream_model(
         action=action,
         robot=robot,
         settings=settings,
-        controller=make_controller(robot.chain, settings, checkpoint.contact_rules_of(action), checkpoint.n_states),
+        controller=make_controller(robot, settings, checkpoint.contact_rules_of(action), checkpoint.n_states, rate),
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,
@@ -155,6 +157,8 @@ def step(
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
+        human_latent_mean=said.human_mean[0],
+        human_latent_std=said.human_std[0],
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
         joints_decoded=decoded[0],
@@ -176,6 +180,7 @@ def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Comma
         size, n_states = model.models[0].human_vae.latent_size, model.controller.n_states
         nothing = {
             "log_alpha": np.full(n_states, np.nan), "log_transition": np.nan, "active_state": -1,
+            "human_latent_mean": np.full(size, np.nan), "human_latent_std": np.full(size, np.nan),
             "robot_latent_mean": np.full(size, np.nan), "robot_latent_covariance": np.full((size, size), np.nan),
             "joints_decoded": np.full(model.robot.chain.n_joints, np.nan), "target": np.full(3, np.nan),
         }  # fmt: skip

@@ -15,7 +15,7 @@ from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
 from mild_viz.settings import CONTROLLERS, ControlSettings
-from tests.controllers import LOW, cut, frames, unhindered
+from tests.controllers import LOW, RATE, cut, frames, unhindered
 
 ROBOT = load_robot("pepper")
 CHAIN = ROBOT.chain
@@ -90,7 +90,7 @@ def test_equals_a_plain_loop(interaction, controller, action, smoothing):
 
 def own(settings: ControlSettings, action: str = "handshake") -> Controller:
     """With the arm's own limits."""
-    return make_controller(CHAIN, settings, DEFAULT_RULES[action], STATES)
+    return make_controller(ROBOT, settings, DEFAULT_RULES[action], STATES, RATE)
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -19,21 +19,22 @@ from mild_viz.robot.control import rules
 from mild_viz.robot.control.controller import ControlCarry, Controller, ControlResult, Frames, make_controller
 from mild_viz.robot.control.kernels import LONGEST, RETURN_SPEED, SHORTEST
 from mild_viz.robot.control.rules import DEFAULT_RULES
-from mild_viz.robot.control.safety import MARGIN, Limits, limits_of
+from mild_viz.robot.control.safety import Limits, limits_of
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
 from mild_viz.settings import CONTROLLERS, ControlSettings, Watch
 from tests.controllers import RATE, cut, frames, unhindered
 
-CHAIN = load_robot("pepper").chain
-LIMITS = limits_of(CHAIN)
+ROBOT = load_robot("pepper")
+CHAIN, SPEC = ROBOT.chain, ROBOT.spec.safety
+LIMITS = limits_of(CHAIN, SPEC)
 STATES = 3
 HOME = forward(CHAIN, LIMITS.rest[None])
 
 
 def controller(name: str = "mild", action: str = "handshake", **changes: object) -> Controller:
     chosen = replace(ControlSettings(controller=name, contact_states=frozenset({1}), smoothing=1.0), **changes)
-    return make_controller(CHAIN, chosen, DEFAULT_RULES[action], STATES)
+    return make_controller(ROBOT, chosen, DEFAULT_RULES[action], STATES, RATE)
 
 
 def steps(seconds: np.ndarray) -> list[float]:
@@ -192,12 +193,8 @@ def test_it_brakes_before_a_limit_whatever_the_times() -> None:
 
 def test_base_ik_near_full_stretch_no_longer_leaps() -> None:
     """A rocket, whose hand comes and goes at the border of the reach: the solutions leap, the command does not."""
-    model, robot, trial = (
-        load_checkpoint(default_checkpoint("demo")),
-        load_robot("pepper"),
-        load_dataset("demo").test[10],
-    )
-    rollout = control(infer(model, trial, "v3.1"), model, robot, trial, ControlSettings(controller="base-ik"))
+    model, trial = load_checkpoint(default_checkpoint("demo")), load_dataset("demo").test[10]
+    rollout = control(infer(model, trial, "v3.1"), model, ROBOT, trial, ControlSettings(controller="base-ik"))
     n = len(rollout.target)
     free = unhindered(CHAIN, ControlSettings(controller="base-ik"), "rocket", 3)
     given = frames(np.zeros((n, 3)), np.tile(CHAIN.rest, (n, 1)), rollout.target)
@@ -309,12 +306,13 @@ def test_idle_is_a_frame_without_an_observation() -> None:
 def test_limits_are_the_descriptions_less_a_margin() -> None:
     np.testing.assert_allclose(LIMITS.velocity, [7.33998, 9.22756, 7.33998, 9.22756])
     np.testing.assert_allclose(LIMITS.acceleration, 10.0 * LIMITS.velocity)
-    np.testing.assert_allclose(LIMITS.lower, CHAIN.lower + MARGIN)
-    np.testing.assert_allclose(LIMITS.upper, CHAIN.upper - MARGIN)
-    near = limits_of(replace(CHAIN, rest=CHAIN.lower, velocity=np.full(4, np.inf)))
+    np.testing.assert_allclose(LIMITS.lower, CHAIN.lower + SPEC.margin)
+    np.testing.assert_allclose(LIMITS.upper, CHAIN.upper - SPEC.margin)
+    near = limits_of(replace(CHAIN, rest=CHAIN.lower, velocity=np.full(4, np.inf)), SPEC)
     np.testing.assert_array_equal(near.lower, CHAIN.lower)  # the robot rests there
     np.testing.assert_array_equal(near.velocity, np.full(4, 3.14))
-    narrow = limits_of(replace(CHAIN, lower=CHAIN.rest - 0.01, upper=CHAIN.rest + 0.01))
+    np.testing.assert_array_equal(limits_of(CHAIN, replace(SPEC, acceleration=5.0)).acceleration, np.full(4, 5.0))
+    narrow = limits_of(replace(CHAIN, lower=CHAIN.rest - 0.01, upper=CHAIN.rest + 0.01), SPEC)
     np.testing.assert_allclose(narrow.upper - narrow.lower, 0.01)
 
 

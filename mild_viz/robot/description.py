@@ -56,7 +56,7 @@ class Joint:
     """Infinite where the file states no limit [rad or m]."""
     upper: float
     velocity: float
-    """Largest speed [rad/s or m/s]; infinite where the file states none (0 says nothing either)."""
+    """Largest speed [rad/s or m/s]; infinite where the file states none."""
     mimic: tuple[str, float, float] | None
     """(joint, multiplier, offset) where this joint follows another one."""
 
@@ -222,8 +222,9 @@ def _convert(joint: yourdfpy.Joint) -> Joint:
         upper = upper if joint.limit.upper is None else float(joint.limit.upper)
         if not lower <= upper:
             raise ValueError(f"joint {joint.name} has the limits {lower} to {upper}")
-    stated = None if joint.limit is None else joint.limit.velocity
-    velocity = float(stated) if stated and float(stated) > 0.0 else np.inf
+    velocity = np.inf
+    if joint.limit is not None and joint.limit.velocity:  # 0 stands for "not stated" in many files
+        velocity = abs(float(joint.limit.velocity))
     mimic = None
     if joint.mimic is not None:
         multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
