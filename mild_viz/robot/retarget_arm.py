@@ -69,14 +69,15 @@ class PositionRule:
 
 
 POSITION_RULES: dict[tuple[str, ...], PositionRule] = {
-    # on a table of 0.7 m, its shoulder is 0.3 m below a person's; its elbow stands above the line to the hand. Dear:
-    # the joints that leave the vertical plane; cheap: the one that raises the hand
+    # on a table of 0.7 m, its shoulder is 0.3 m below a person's. Its elbow stands above the line to the hand, where
+    # another place would take the wrist to its limits. Dear: the joints that leave the vertical plane; cheap: the one
+    # that raises the hand
     PANDA_JOINTS: PositionRule(
-        0.3, 7e-4, (1.0, 0.0, 0.0), 2.5e-4, lean=0.7, rise=0.7, side=0.5,
-        joint_weights=(1.0, 1.0, 3.0, 1.0, 3.0, 0.1, 1.0),
+        0.3, 7e-4, (1.0, 0.0, 0.0), 2.5e-4, lean=0.7, rise=0.7, joint_weights=(1.0, 1.0, 3.0, 1.0, 3.0, 0.1, 1.0)
     ),
+    # its elbow hangs as a person's does, and goes aside with it
     YUMI_JOINTS: PositionRule(0.0, 2e-4, (0.0, 0.0, 1.0), 2.5e-4, lean=0.5, rise=-0.8, side=1.0),
-}  # fmt: skip
+}
 """By the arm's joints. The numbers were chosen on training trials alone, by how level the hand is, how often a joint is
 at `MAX_RATE`, and how much of the motion ridge regression and nearest neighbours learn."""
 
