@@ -40,7 +40,7 @@ class TorchIK:
             )
         self.serial = serial.to(dtype=torch.float64)
         names = self.serial.get_joint_parameter_names()
-        values = description.values(robot.rest)
+        values = description.values(dict(robot.spec.rest))
         self.resting = torch.tensor([values[name] for name in names], dtype=torch.float64)
         self.columns = [names.index(name) for name in chain.joint_names]
         self.lower, self.upper = torch.tensor(chain.lower), torch.tensor(chain.upper)

@@ -18,15 +18,9 @@ from mild_viz.robot.contact import contact_frames, in_frame, upright
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.placement import recorded_placement
-from mild_viz.robot.retarget_arm import (
-    LARGEST_FRACTION,
-    MAX_RATE,
-    PositionRule,
-    position_rule,
-    retarget_arm,
-    scaled_wrist,
-)
-from mild_viz.robot.robots import PANDA_JOINTS, PEPPER_JOINTS, YUMI_JOINTS
+from mild_viz.robot.position_rule import PositionRule
+from mild_viz.robot.retarget_arm import LARGEST_FRACTION, MAX_RATE, retarget_arm, scaled_wrist
+from mild_viz.robot.robots import ROBOTS
 from mild_viz.trial import Trial
 
 PANDA, YUMI = load_robot("panda").chain, load_robot("yumi").chain
@@ -51,7 +45,7 @@ def test_keeps_direction_and_fraction_of_reach() -> None:
     reach = (arm[:, 2] - arm[:, 0]) / 0.55
     hand = forward(YUMI, retarget_arm(YUMI, arm, RATE))
     np.testing.assert_allclose(hand, YUMI.shoulder + YUMI.reach * reach, atol=5e-3)  # the other terms' price
-    lifted = PANDA.shoulder + PANDA.reach * reach + [0.0, 0.0, position_rule(PANDA).lift]
+    lifted = PANDA.shoulder + PANDA.reach * reach + [0.0, 0.0, PANDA.position.lift]
     far = np.linalg.norm(lifted - PANDA.shoulder, axis=1) > LARGEST_FRACTION * PANDA.reach
     hand = forward(PANDA, retarget_arm(PANDA, arm, RATE))
     assert not far.all()
@@ -100,15 +94,15 @@ def pointing(chain: ArmChain, joints: np.ndarray) -> np.ndarray:
     hand = np.tile(np.eye(3), (len(joints), 1, 1))
     for offset, axis, angles in zip(chain.offsets[:-1], chain.axes, joints.T, strict=True):
         hand = hand @ offset[:3, :3] @ Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
-    return hand @ chain.offsets[-1, :3, :3] @ position_rule(chain).tool_axis
+    return hand @ chain.offsets[-1, :3, :3] @ chain.position.tool_axis
 
 
 def elbows(chain: ArmChain, joints: np.ndarray) -> np.ndarray:
     """Where the elbow is (T, 3), by the kinematics of the arm up to its joint."""
-    n = position_rule(chain).elbow
+    n = chain.joint_names.index(chain.elbow or "")
     upper = replace(
         chain, joint_names=chain.joint_names[:n], lower=chain.lower[:n], upper=chain.upper[:n], rest=chain.rest[:n],
-        offsets=chain.offsets[: n + 1], axes=chain.axes[:n],
+        velocity=chain.velocity[:n], offsets=chain.offsets[: n + 1], axes=chain.axes[:n],
     )  # fmt: skip
     return forward(upper, joints[:, :n])
 
@@ -129,8 +123,7 @@ def test_the_elbow_lies_as_the_rule_says() -> None:
 
 
 def test_an_arm_without_a_rule_keeps_the_place_of_the_hand() -> None:
-    arm, made = reaching(), replace(PANDA, joint_names=tuple("abcdefg"))
-    assert position_rule(made) == PositionRule()
+    arm, made = reaching(), replace(PANDA, position=PositionRule())
     hand = forward(made, retarget_arm(made, arm, RATE))
     np.testing.assert_allclose(hand, made.shoulder + made.reach * (arm[:, 2] - arm[:, 0]) / 0.55, atol=2e-3)
 
@@ -177,7 +170,7 @@ def test_all_recordings_become_motions_that_the_robot_can_make(
 
 def test_windows_for_training_repeat_exactly(dataset: Callable[[str], Any]) -> None:
     trials = dataset("handover").train[:3]
-    first, second = (stack_windows(trials, PANDA_JOINTS) for _ in range(2))
+    first, second = (stack_windows(trials, ROBOTS["panda"].joint_names) for _ in range(2))
     assert first.partner.shape[1] == 35 and first.complete.all()
     np.testing.assert_array_equal(first.partner, second.partner)
 
@@ -189,7 +182,7 @@ def test_the_hands_meet_where_the_handover_took_place(dataset: Callable[[str], A
         assert placed is not None
         contact = contact_frames(trial)
         receiver = in_frame(placed.T_world_human, trial.human_arm[contact, 2])
-        hand = forward(PANDA, robot_truth(trial, PANDA_JOINTS)[contact])
+        hand = forward(PANDA, robot_truth(trial, ROBOTS["panda"].joint_names)[contact])
         between = np.median(np.linalg.norm(hand - receiver, axis=1))
         assert between < 0.15, trial.name
 
@@ -197,16 +190,16 @@ def test_the_hands_meet_where_the_handover_took_place(dataset: Callable[[str], A
 @pytest.mark.parametrize("name", ["demo", "nuisi"])
 def test_any_partner_can_be_retargeted(name: str, dataset: Callable[[str], Any]) -> None:
     trial = dataset(name).test[0]
-    for joints in (PANDA_JOINTS, YUMI_JOINTS):
+    for joints in (ROBOTS["panda"].joint_names, ROBOTS["yumi"].joint_names):
         truth = robot_truth(trial, joints)
         assert truth.shape == (trial.n_frames, 7) and np.isfinite(truth).all()
-    np.testing.assert_array_equal(robot_truth(trial, PEPPER_JOINTS).shape, (trial.n_frames, 4))
+    np.testing.assert_array_equal(robot_truth(trial, ROBOTS["pepper"].joint_names).shape, (trial.n_frames, 4))
 
 
 def test_without_a_partner_or_a_known_robot_there_is_no_truth() -> None:
     trial = Trial("made", "test", 0, "handover", RATE, human_arm=reaching(), partner_arm=reaching())
-    assert robot_truth(trial, PANDA_JOINTS).shape == (T, 7)
+    assert robot_truth(trial, ROBOTS["panda"].joint_names).shape == (T, 7)
     with pytest.raises(UserError, match="no motion for the joints elbow; it has no recorded robot"):
         robot_truth(trial, ("elbow",))
     with pytest.raises(UserError, match="no motion for the joints panda_joint1"):
-        robot_truth(replace(trial, partner_arm=None), PANDA_JOINTS)
+        robot_truth(replace(trial, partner_arm=None), ROBOTS["panda"].joint_names)

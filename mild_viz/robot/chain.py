@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.description import TURNING, Description, Joint
+from mild_viz.robot.position_rule import PositionRule
 from mild_viz.trial import freeze_arrays
 
 FOLD_VERSION = 2
@@ -42,10 +43,16 @@ class ArmChain:
     end_effector: str
     lower: Float[np.ndarray, " J"]
     upper: Float[np.ndarray, " J"]
+    velocity: Float[np.ndarray, " J"]
+    """Largest speed of each joint [rad/s]; infinite where the description states none."""
     rest: Float[np.ndarray, " J"]
     """Where the joints stand when nothing moves them [rad]."""
     offsets: Float[np.ndarray, "_ 4 4"]
     axes: Float[np.ndarray, "J 3"]
+    elbow: str | None = None
+    """Joint whose origin is the elbow."""
+    position: PositionRule = PositionRule()
+    """How it takes over a person's posture."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -101,9 +108,15 @@ def kernel_array(values: np.ndarray) -> np.ndarray:
 
 
 def load_chain(
-    description: Description, joint_names: tuple[str, ...], end_effector: str, rest: dict[str, float]
+    description: Description,
+    joint_names: tuple[str, ...],
+    end_effector: str,
+    rest: dict[str, float],
+    tip_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ArmChain:
-    """The chain of `joint_names` up to `end_effector`; joints in between that are not named rest.
+    """The chain of `joint_names` up to `end_effector`, moved by `tip_offset` [m] in its own frame.
+
+    Joints in between that are not named rest.
 
     Raises `UserError` where a joint or the end effector is missing, where a joint does not turn or states no
     limits, where it is not between the base and the end effector in the given order, or where a joint of several
@@ -134,9 +147,13 @@ def load_chain(
         )
     values = description.values(rest)
     offsets, axes = _cached_fold(description, joint_names, end_effector, values)
+    tip = np.eye(4)
+    tip[:3, 3] = tip_offset
+    offsets = np.concatenate([offsets[:-1], [offsets[-1] @ tip]])
     lower, upper = np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+    velocity = np.array([joint.velocity for joint in joints])
     resting = np.array([values[name] for name in joint_names])
-    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, offsets, axes)
+    return ArmChain(tuple(joint_names), end_effector, lower, upper, velocity, resting, offsets, axes)
 
 
 def cache_folder() -> Path:

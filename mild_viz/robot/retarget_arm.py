@@ -1,7 +1,7 @@
 """Joint angles of any robot arm from a person's shoulder, elbow and wrist: the hand's place is kept, by IK.
 
 The person's wrist, seen from the shoulder, is scaled from the length of the person's arm to the robot's reach. What a
-`PositionRule` says beside it, per robot: how the hand is held, and where the elbow lies.
+`PositionRule` of its robot.toml says beside it: how the hand is held, and where the elbow lies.
 
 The IK's prior is the resting posture in every frame, not the last solution: the joints are then a function of where
 the hand and the elbow are, and do not drift through the postures that leave the hand in place. That is what a model
@@ -11,8 +11,6 @@ posture that can be reached in time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +18,6 @@ from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import arm_length
 from mild_viz.robot.ik import solve_ik
 from mild_viz.robot.objective.terms import IKTerms
-from mild_viz.robot.robots import PANDA_JOINTS, YUMI_JOINTS
 
 LARGEST_FRACTION = 0.9
 """The robot uses this fraction of its reach at most, since a stretched arm cannot adapt."""
@@ -39,54 +36,6 @@ person would otherwise be faster in proportion, and a tracking error is no motio
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
-class PositionRule:
-    """How an arm takes over a person's posture, beside the place of the hand; as it stands: not at all.
-
-    Both directions are relative to the vertical plane through shoulder and hand, in which most arms work: turned
-    with it, they ask as little of the joints as can be, and leave more for a model to learn.
-    """
-
-    lift: float = 0.0
-    """How much higher the hand is than direction and fraction of reach say [m]: a robot without a torso stands lower
-    beside a person than its shoulder would have to."""
-    level_weight: float = 0.0
-    """Weight of holding the hand level, and pointing away from the shoulder [m^2/rad^2]."""
-    tool_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Where the hand points, in the frame of the end effector."""
-    elbow_weight: float = 0.0
-    """Weight of the elbow's direction [m^2]."""
-    elbow: int = 3
-    """Number of the joint at the elbow."""
-    lean: float = 0.0
-    """The elbow's direction from the shoulder: this much towards the hand,"""
-    rise: float = 0.0
-    """this much up,"""
-    side: float = 0.0
-    """and this much of how far the person's elbow stands out of that plane, in lengths of the upper arm."""
-    joint_weights: tuple[float, ...] | None = None
-    """What each joint costs that strays from the resting posture; 1 where None."""
-
-
-POSITION_RULES: dict[tuple[str, ...], PositionRule] = {
-    # on a table of 0.7 m, its shoulder is 0.3 m below a person's. Its elbow stands above the line to the hand, where
-    # another place would take the wrist to its limits. Dear: the joints that leave the vertical plane; cheap: the one
-    # that raises the hand
-    PANDA_JOINTS: PositionRule(
-        0.3, 7e-4, (1.0, 0.0, 0.0), 2.5e-4, lean=0.7, rise=0.7, joint_weights=(1.0, 1.0, 3.0, 1.0, 3.0, 0.1, 1.0)
-    ),
-    # its elbow hangs as a person's does, and goes aside with it
-    YUMI_JOINTS: PositionRule(0.0, 2e-4, (0.0, 0.0, 1.0), 2.5e-4, lean=0.5, rise=-0.8, side=1.0),
-}
-"""By the arm's joints. The numbers were chosen on training trials alone, by how level the hand is, how often a joint is
-at `MAX_RATE`, and how much of the motion ridge regression and nearest neighbours learn."""
-
-
-def position_rule(chain: ArmChain) -> PositionRule:
-    """The rule of a known arm, else one that keeps the hand's place alone."""
-    return POSITION_RULES.get(chain.joint_names, PositionRule())
-
-
 def scaled_wrist(
     chain: ArmChain, arm: Float[np.ndarray, "T 3 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "T 3"]:
@@ -95,7 +44,7 @@ def scaled_wrist(
     Direction and fraction of reach are kept, but for the lift of the arm's rule; the latter up to `LARGEST_FRACTION`.
     `rotation` turns the person's frame into the robot's base frame. NaN where the arm was not tracked.
     """
-    reach = (arm[:, 2] - arm[:, 0]) @ rotation.T / arm_length(arm) + position_rule(chain).lift / chain.reach * UP
+    reach = (arm[:, 2] - arm[:, 0]) @ rotation.T / arm_length(arm) + chain.position.lift / chain.reach * UP
     fraction = np.linalg.norm(reach, axis=1, keepdims=True)
     along = reach / np.maximum(fraction, np.finfo(float).tiny)
     return chain.shoulder + chain.reach * np.minimum(fraction, LARGEST_FRACTION) * along
@@ -107,7 +56,7 @@ def retarget_arm(
     """Joints [rad] of T frames of shoulder, elbow, wrist [m] at `rate` [Hz], within the limits and `MAX_RATE`.
 
     `rotation` turns the person's frame (x forward, y left, z up) into the robot's base frame; None: they are equal.
-    The arm's `position_rule` says how hand and elbow are held. Frames in which the arm was not tracked (NaN) give NaN,
+    The arm's `PositionRule` says how hand and elbow are held. Frames in which the arm was not tracked (NaN) give NaN,
     and the motion begins anew after them. (Eq. ik-prior-simplified with the resting posture as prior, and the terms of
     `IKTerms`.)
     """
@@ -120,7 +69,7 @@ def retarget_arm(
 
 def _held(chain: ArmChain, targets: Float[np.ndarray, "T 3"], arm: Float[np.ndarray, "T 3 3"], rate: float) -> IKTerms:
     """The terms of the arm's rule for hands at `targets`; `arm` is the person's, turned into the base frame."""
-    rule = position_rule(chain)
+    rule = chain.position
     outward = _unit((targets - chain.shoulder) * (1.0, 1.0, 0.0))
     across = np.cross(UP, outward)
     line, upper = _unit(arm[:, 2] - arm[:, 0]), _unit(arm[:, 1] - arm[:, 0])
@@ -131,10 +80,10 @@ def _held(chain: ArmChain, targets: Float[np.ndarray, "T 3"], arm: Float[np.ndar
         tool_axis=np.array(rule.tool_axis),
         tool_direction=outward,
         elbow_weight=rule.elbow_weight,
-        elbow_joint=chain.joint_names[rule.elbow] if rule.elbow_weight > 0.0 else None,
+        elbow_joint=chain.elbow,
         elbow_direction=rule.lean * outward + rule.rise * UP + aside * across,
-        joint_weights=None if rule.joint_weights is None else np.array(rule.joint_weights),
-        max_step=MAX_RATE / rate,
+        joint_weights=np.array(rule.joint_weights) if rule.joint_weights else None,
+        max_step=np.minimum(MAX_RATE, chain.velocity) / rate,
     )
 
 
