@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
+SourceName = Literal["own", "robot_descriptions"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
@@ -88,8 +89,11 @@ class RunOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. Default: the robot that the model
-            was trained for. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, kobo, a folder with a robot.toml, or the path of a URDF file.
+            Default: the robot that the model was trained for. Example: --robot ~/pepper.urdf
+        robot_source: Where the robot's looks come from: own, or robot_descriptions, the Python package that downloads
+            the manufacturer's meshes (needs: pip install 'mild-viz[robots]'). Without network ours are shown.
+            Example: --robot-source robot_descriptions
     """
 
     checkpoint: OptionalPath = None
@@ -105,6 +109,7 @@ class RunOptions:
     stiffness: bool = True
     placement: OptionalPosition = None
     robot: OptionalText = None
+    robot_source: SourceName = "own"
 
     def run(self) -> tuple[Rollout, RobotModel]:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
@@ -126,5 +131,6 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = load_robot(self.robot or interface.name, interface.joint_names, interface.end_effector)
+        name = self.robot or interface.name
+        robot = load_robot(name, interface.joint_names, interface.end_effector, self.robot_source)
         return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings), robot

@@ -22,6 +22,7 @@ from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
 from mild_viz.settings import ControlSettings, InferSettings, choose
 from mild_viz.trial import Dataset, Trial
@@ -140,6 +141,7 @@ def open_dashboard(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Dashboard:
@@ -155,7 +157,7 @@ def open_dashboard(
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
     interface = model.for_robot()
-    arm = load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
+    arm = load_robot(robot or interface.name, interface.joint_names, interface.end_effector, robot_source)
     catalog = Catalog(arm, folder)
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
@@ -172,12 +174,13 @@ def run(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
 ) -> None:
     """Start the page and serve it until Ctrl-C."""
-    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, host, port)
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port)
     console = Console()
     console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
     if not is_loopback(host):
