@@ -58,7 +58,7 @@ def published_description(spec: RobotSpec, ours: Description) -> Description:
 def _download(spec: RobotSpec) -> Path:
     """The URDF that the package names; the package fetches it at the first time, saying so where messages go."""
     if spec.robot_descriptions is None:
-        raise UserError(f"{PACKAGE} has no {spec.title}: no robot.toml names a module of it")
+        raise UserError(f"{PACKAGE} has no {spec.title}: its robot.toml names no module of that package")
     os.environ.setdefault("GIT_TERMINAL_PROMPT", "0")  # a person is not asked for a password that does not help
     try:
         importlib.import_module(PACKAGE)  # first alone: is it the package that is missing, or the module?
@@ -70,7 +70,8 @@ def _download(spec: RobotSpec) -> Path:
             raise UserError(f"{PACKAGE} has no module {spec.robot_descriptions}") from None
         raise UserError(f"the package {error.name} is not installed; pip install 'mild-viz[robots]'") from None
     except Exception as error:  # git's, the file system's, or the package's own
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        print(file=sys.stderr)  # the package's progress bar leaves its line open
+        lines = [line.strip(" '") for line in str(error).splitlines() if line.strip(" '")] or [type(error).__name__]
         reason = next((line[line.index("fatal:") :] for line in lines if "fatal:" in line), lines[-1])
         raise UserError(f"{spec.robot_descriptions} cannot be downloaded, is there a network? ({reason})") from None
 
