@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mild_viz.dashboard.catalog import Catalog
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.paths import checkpoints
@@ -142,6 +143,13 @@ def test_a_wrong_entry_is_named(crane: Path, edit: tuple[str, str], message: str
     with pytest.raises(UserError, match="robot.toml|crane.urdf") as caught:
         load_robot(str(crane))
     assert message in str(caught.value)
+
+
+def test_the_chooser_of_the_page_has_it_by_its_title(crane: Path) -> None:
+    assert Catalog(load_robot(str(crane))).robot_titles["crane"] == "Crane"
+    file = crane / "robot.toml"
+    file.write_text(file.read_text().replace('"Crane"', '"Panda"'))
+    assert Catalog(load_robot(str(crane))).robot_titles["crane"] == "Panda (crane)"  # no two of one title
 
 
 def test_what_is_no_robot_is_refused(tmp_path: Path) -> None:

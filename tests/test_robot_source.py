@@ -18,6 +18,7 @@ import pytest
 from robot_descriptions import _repositories
 
 from mild_viz import cli
+from mild_viz.dashboard.catalog import Catalog
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
 
@@ -94,6 +95,10 @@ def test_the_manufacturers_looks_on_our_joints(
         theirs, ours = (pose[:, one.link_names.index(link)] for pose, one in zip(poses, (robot, own), strict=True))
         np.testing.assert_allclose(theirs[:, 4:], ours[:, 4:], atol=1e-4, err_msg=link)
         np.testing.assert_allclose(np.abs(np.sum(theirs[:, :4] * ours[:, :4], axis=1)), 1.0, atol=1e-6, err_msg=link)
+    # the page's chooser offers it once, under its name
+    catalog = Catalog(robot, source="robot_descriptions")
+    assert catalog.robot_name == "pepper" and catalog.robot("pepper") is robot
+    assert sorted(catalog.robot_titles.values()) == ["Kobo", "Panda", "Pepper", "YuMi"]
     assert robot.floor == pytest.approx(own.floor, abs=0.03)  # LIRMM's floor is 27 mm nearer to the shoulders
 
 
