@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
+SourceName = Literal["own", "robot_descriptions"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
@@ -88,9 +89,12 @@ class RunOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. A model of a second human
-            (nuisi-human, handover-human) moves any of them. Default: the robot that the model was trained for, or
-            that of its dataset. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, kobo, a folder with a robot.toml, or the path of a URDF file. A
+            model of a second human (nuisi-human, handover-human) moves any of them. Default: the robot that the model
+            was trained for, or that of its dataset. Example: --robot ~/pepper.urdf
+        robot_source: Where the robot's looks come from: own, or robot_descriptions, the Python package that downloads
+            the manufacturer's meshes (needs: pip install 'mild-viz[robots]'). Without network ours are shown.
+            Example: --robot-source robot_descriptions
     """
 
     checkpoint: OptionalPath = None
@@ -106,6 +110,7 @@ class RunOptions:
     stiffness: bool = True
     placement: OptionalPosition = None
     robot: OptionalText = None
+    robot_source: SourceName = "own"
 
     def run(self) -> tuple[Rollout, RobotModel]:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
@@ -126,7 +131,7 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = open_robot(checkpoint, self.robot)
+        robot = open_robot(checkpoint, self.robot, self.robot_source)
         return control(
             infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot),
             checkpoint,
