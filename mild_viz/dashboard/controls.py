@@ -136,7 +136,7 @@ def header_html(rollout: Rollout, model: str) -> str:
     """What is shown, and how well the model itself (not the controller) predicts this trial."""
     inference = rollout.inference
     errors = inference.window_error[np.isfinite(inference.window_error)]
-    mse = f"{errors.mean():.4f} rad²" if len(errors) else "unknown (no true motion)"
+    mse = f"{errors.mean():.4f} {inference.error_unit}" if len(errors) else "unknown (no true motion)"
     return (
         f'<div class="mv-header"><b>{escape(inference.dataset)} · {escape(inference.action)} · '
         f"{escape(inference.split)} {inference.trial}</b><br>"
