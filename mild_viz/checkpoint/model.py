@@ -119,13 +119,13 @@ class Checkpoint:
         """The transition state that a controller may use; None where there is none."""
         return self.members(variant)[0].transition_states.get(action)
 
-    def contact_rules_of(self, action: str) -> ContactRules:
-        """How the robot behaves in the contact of an action."""
-        return self.contact_rules.get(action, DEFAULT_RULES[action])
-
     def placement_for(self, chain: ArmChain) -> Placement | None:
         """Where the human stands before a robot, as far as the model knows it."""
         return self.placement or (self.meeting and self.meeting.placement(chain))
+
+    def contact_rules_of(self, action: str) -> ContactRules:
+        """How the robot behaves in the contact of an action."""
+        return self.contact_rules.get(action, DEFAULT_RULES[action])
 
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""
