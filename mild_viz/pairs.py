@@ -50,7 +50,7 @@ class Windows:
 def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "T J"]:
     """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to a known robot.
 
-    Pepper's arm takes over the angles of the person's, every other one the place of the hand. Where the partner's
+    The robot's own rule says how (`ArmSpec.retarget`). Where the partner's
     heading in the world is known, the robot stands upright with that heading. NaN where the partner was not tracked
     for longer than a gap that is filled.
 
@@ -59,14 +59,14 @@ def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "
     """
     if trial.robot_joints is not None and tuple(trial.robot_joint_names) == tuple(joint_names):
         return trial.robot_joints
-    robot = next((name for name, known in ROBOTS.items() if known.joint_names == tuple(joint_names)), None)
+    robot = next((name for name, spec in ROBOTS.items() if spec.joint_names == tuple(joint_names)), None)
     if trial.partner_arm is None or robot is None:
         raise UserError(
             f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
             f"it has {', '.join(trial.robot_joint_names) or 'no recorded robot'}"
         )
     arm = fill_gaps(trial.partner_arm, max_gap(trial.rate))
-    if robot == "pepper":
+    if ROBOTS[robot].main.retarget == "pepper-angles":
         return retarget_pepper(arm)
     world = trial.T_world_partner
     return retarget_arm(_chain(robot), arm, trial.rate, None if world is None else upright(world) @ world[:3, :3])

@@ -42,6 +42,8 @@ class ArmChain:
     end_effector: str
     lower: Float[np.ndarray, " J"]
     upper: Float[np.ndarray, " J"]
+    velocity: Float[np.ndarray, " J"]
+    """Largest speed of each joint [rad/s]; infinite where the description states none."""
     rest: Float[np.ndarray, " J"]
     """Where the joints stand when nothing moves them [rad]."""
     offsets: Float[np.ndarray, "_ 4 4"]
@@ -75,8 +77,7 @@ class ArmChain:
         The links bound it; where bends or limits keep an arm from that, it is the largest distance that IK towards
         far points in many directions finds.
         """
-        from mild_viz.robot.kernels import solve_ik_batch
-        from mild_viz.robot.kinematics.kernels import kinematics_batch
+        from mild_viz.robot.ik import forward, solve_ik  # they take a chain
 
         rng = np.random.default_rng(0)
         away = rng.normal(size=(REACH_STARTS, 3))
@@ -84,8 +85,8 @@ class ArmChain:
         starts = rng.uniform(
             np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi), (REACH_STARTS, self.n_joints)
         )
-        stretched = solve_ik_batch(self.arm, self.shoulder + away, starts, 1.0, 0.0)
-        distances = np.linalg.norm(kinematics_batch(self.arm, stretched)[0] - self.shoulder, axis=1)
+        stretched = solve_ik(self, self.shoulder + away, starts, 1.0, 0.0)
+        distances = np.linalg.norm(forward(self, stretched) - self.shoulder, axis=1)
         return float(distances.max())
 
 
@@ -102,9 +103,15 @@ def kernel_array(values: np.ndarray) -> np.ndarray:
 
 
 def load_chain(
-    description: Description, joint_names: tuple[str, ...], end_effector: str, rest: dict[str, float]
+    description: Description,
+    joint_names: tuple[str, ...],
+    end_effector: str,
+    rest: dict[str, float],
+    tip_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ArmChain:
-    """The chain of `joint_names` up to `end_effector`; joints in between that are not named rest.
+    """The chain of `joint_names` up to `end_effector`, moved by `tip_offset` [m] in its own frame.
+
+    Joints in between that are not named rest.
 
     Raises `UserError` where a joint or the end effector is missing, where a joint does not turn or states no
     limits, where it is not between the base and the end effector in the given order, or where a joint of several
@@ -135,9 +142,13 @@ def load_chain(
         )
     values = description.values(rest)
     offsets, axes = _cached_fold(description, joint_names, end_effector, values)
+    tip = np.eye(4)
+    tip[:3, 3] = tip_offset
+    offsets = np.concatenate([offsets[:-1], [offsets[-1] @ tip]])
     lower, upper = np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+    velocity = np.array([joint.velocity for joint in joints])
     resting = np.array([values[name] for name in joint_names])
-    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, offsets, axes)
+    return ArmChain(tuple(joint_names), end_effector, lower, upper, velocity, resting, offsets, axes)
 
 
 def cache_folder() -> Path:

@@ -2,7 +2,8 @@
 
 They work on plain float64 arrays; an arm is laid out as `kinematics.kernels` says. The typed wrappers are
 `ik` and `controller`. Kernels that call each other are kept together where possible, because numba's cache
-notices changes only in a function's own file: after a change in kinematics/kernels.py, remove __pycache__ here.
+notices changes only in a function's own file: after a change in kinematics/kernels.py or objective/kernels.py, remove
+__pycache__ here.
 """
 
 import math
@@ -10,7 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from mild_viz.robot.kinematics.kernels import LOWER, UPPER, arm_forward, arm_jacobian
+from mild_viz.robot.kinematics.kernels import LOWER, UPPER, arm_forward
+from mild_viz.robot.objective.kernels import ELBOW, JOINT_WEIGHTS, TURN, derivatives, objective, plain_terms
 
 BASE_IK, MILD, MILD_IK = 0, 1, 2
 """Controllers, in the order of `settings.CONTROLLERS`."""
@@ -24,37 +26,6 @@ REACHING, CROSSING, TOUCHING = 0, 1, 2
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-10
 """Largest projected gradient at which the solver stops, relative to the larger weight (at least 1)."""
-
-
-@njit(cache=True, fastmath=False)
-def _objective(position, target, q, prior, lambda_x, lambda_q):
-    """Eq. ik-prior-simplified."""
-    reach = (position[0] - target[0]) ** 2 + (position[1] - target[1]) ** 2 + (position[2] - target[2]) ** 2
-    stray = 0.0
-    for i in range(q.shape[0]):
-        stray += (q[i] - prior[i]) ** 2
-    return lambda_x * reach + lambda_q * stray
-
-
-@njit(cache=True, fastmath=False)
-def _derivatives(jacobian, directions, position, target, q, prior, lambda_x, lambda_q, gradient, hessian):
-    """Half the gradient (J,) and half the exact Hessian (J, J) of Eq. ik-prior-simplified.
-
-    For turning joints i <= j the second derivative of the position is directions[i] x jacobian[j].
-    """
-    n = q.shape[0]
-    ex, ey, ez = position[0] - target[0], position[1] - target[1], position[2] - target[2]
-    for i in range(n):
-        ax, ay, az = directions[i, 0], directions[i, 1], directions[i, 2]
-        gx, gy, gz = jacobian[i, 0], jacobian[i, 1], jacobian[i, 2]
-        gradient[i] = lambda_x * (gx * ex + gy * ey + gz * ez) + lambda_q * (q[i] - prior[i])
-        # e . (a x J_j) = J_j . (e x a)
-        gx, gy, gz = gx + ey * az - ez * ay, gy + ez * ax - ex * az, gz + ex * ay - ey * ax
-        for j in range(i, n):
-            hessian[i, j] = lambda_x * (jacobian[j, 0] * gx + jacobian[j, 1] * gy + jacobian[j, 2] * gz)
-            if i == j:
-                hessian[i, j] += lambda_q
-            hessian[j, i] = hessian[i, j]
 
 
 @njit(cache=True, fastmath=False)
@@ -134,28 +105,29 @@ def ik_scratch(n):
 
 
 @njit(cache=True, fastmath=False)
-def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
+def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, q, scratch):
     """Bounded Levenberg-Marquardt from the prior (J,), with the exact Hessian; the solution is left in `q`.
 
-    Minimises Eq. ik-prior-simplified for a target (3,). No accepted step increases the objective, and no
-    iterate leaves the limits; a NaN target leaves the clipped prior. `scratch` is `ik_scratch(J)`.
+    Minimises Eq. ik-prior-simplified for a target (3,), and the optional terms beside it (`plain_terms(J)`: none).
+    No accepted step increases the objective, and no iterate leaves the limits; a NaN target leaves the clipped
+    prior. `scratch` is `ik_scratch(J)`. For velocity limits, give the arm that `limit_step` narrows.
     """
     n = q.shape[0]
     vectors, points, frames, squares, fixed = scratch
     gradient, step, candidate, rhs = vectors[0], vectors[1], vectors[2], vectors[3]
     position, moved, hessian, factor = points[0], points[1], squares[0], squares[1]
-    origins, directions, jacobian = frames[0], frames[1], frames[2]
+    origins, directions = frames[0], frames[1]
+    scale = max(lambda_x, terms[TURN], terms[ELBOW])
     for i in range(n):
+        scale = max(scale, lambda_q * terms[JOINT_WEIGHTS + i])
         q[i] = min(max(prior[i], arm[i, LOWER]), arm[i, UPPER])
-    arm_forward(arm, q, origins, directions, position)
-    cost = _objective(position, target, q, prior, lambda_x, lambda_q)
-    scale = max(lambda_x, lambda_q)
+    rotation = arm_forward(arm, q, origins, directions, position)
+    cost = objective(position, rotation, origins, target, q, prior, lambda_x, lambda_q, terms)
     new_cost, damping, growth, still = cost, 0.0, 2.0, False
     if not math.isfinite(cost):  # there is no target
         return
     for _ in range(MAX_ITERATIONS):
-        arm_jacobian(origins, directions, position, jacobian)
-        _derivatives(jacobian, directions, position, target, q, prior, lambda_x, lambda_q, gradient, hessian)
+        derivatives(frames, position, rotation, target, q, prior, lambda_x, lambda_q, terms, gradient, hessian)
         largest = 0.0
         for i in range(n):
             if not _held(arm, q, gradient, i):
@@ -174,8 +146,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
                     predicted -= 2.0 * step[i] * gradient[i]
                     for j in range(n):
                         predicted -= step[i] * hessian[i, j] * step[j]
-                arm_forward(arm, candidate, origins, directions, moved)
-                new_cost = _objective(moved, target, candidate, prior, lambda_x, lambda_q)
+                rotation = arm_forward(arm, candidate, origins, directions, moved)
+                new_cost = objective(moved, rotation, origins, target, candidate, prior, lambda_x, lambda_q, terms)
                 improved = new_cost <= cost
             if improved:
                 gain = (cost - new_cost) / predicted if predicted > 0.0 else 0.0
@@ -202,14 +174,55 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, q, scratch):
 
 
 @njit(cache=True, fastmath=False)
-def solve_ik_batch(arm, targets, priors, lambda_x, lambda_q):
-    """Solve N problems, each from its own prior (N, J); a NaN target (N, 3) gives the clipped prior."""
+def limit_step(arm, previous, max_step, narrowed):
+    """Fill the limits of `narrowed`, a copy of the arm, with those within `max_step` (J,) of `previous` (J,).
+
+    Where the previous joint is NaN, the limits are the arm's; where it stands outside them, they come first.
+    """
+    for i in range(previous.shape[0]):
+        low, high = arm[i, LOWER], arm[i, UPPER]
+        narrowed[i, LOWER], narrowed[i, UPPER] = low, high
+        if not math.isnan(previous[i]):
+            narrowed[i, LOWER] = min(max(previous[i] - max_step[i], low), high)
+            narrowed[i, UPPER] = max(min(previous[i] + max_step[i], high), low)
+
+
+@njit(cache=True, fastmath=False)
+def solve_ik_batch(arm, targets, priors, lambda_x, lambda_q, terms, max_step, previous):
+    """Solve N problems, each from its own prior (N, J); a NaN target (N, 3) gives the clipped prior.
+
+    `terms` has one row for all, or N. No joint goes farther than `max_step` (J,) from the row before, or `previous`.
+    """
     n, size = priors.shape
     scratch = ik_scratch(size)
-    solutions = np.empty((n, size))
+    solutions, narrowed = np.empty((n, size)), arm.copy()
     for k in range(n):
-        solve_ik_one(arm, targets[k], priors[k], lambda_x, lambda_q, solutions[k], scratch)
+        limit_step(arm, previous if k == 0 else solutions[k - 1], max_step, narrowed)
+        own = terms[min(k, terms.shape[0] - 1)]
+        solve_ik_one(narrowed, targets[k], priors[k], lambda_x, lambda_q, own, solutions[k], scratch)
     return solutions
+
+
+@njit(cache=True, fastmath=False)
+def unreachable_one(arm, target, q, tolerance, spare, scratch):
+    """Whether the descent of |target - f| alone from `q` inside the limits ends farther than `tolerance`; see `ik`."""
+    solve_ik_one(arm, target, q, 1.0, 0.0, plain_terms(q.shape[0]), spare, scratch)
+    position, frames = scratch[1][0], scratch[2]
+    arm_forward(arm, spare, frames[0], frames[1], position)
+    apart = 0.0
+    for i in range(3):
+        apart += (position[i] - target[i]) ** 2
+    return apart > tolerance**2  # False without a target
+
+
+@njit(cache=True, fastmath=False)
+def unreachable_batch(arm, targets, solutions, tolerance):
+    """`unreachable_one` for each of N targets (N, 3) from its solution (N, J)."""
+    n, size = solutions.shape
+    scratch, spare, flags = ik_scratch(size), np.empty(size), np.empty(n, np.bool_)
+    for k in range(n):
+        flags[k] = unreachable_one(arm, targets[k], solutions[k], tolerance, spare, scratch)
+    return flags
 
 
 @njit(cache=True, fastmath=False)
@@ -240,7 +253,7 @@ def control_loop(
     stiffness (N,). `previous` (J,) is the last command; `flags` (3,): see STARTED, PROGRESS, VISITED.
     """
     n, size = decoded.shape
-    scratch = ik_scratch(size)
+    scratch, terms = ik_scratch(size), plain_terms(size)
     commands, contact, stiffness = np.empty((n, size)), np.zeros(n, np.bool_), np.ones(n)
     for k in range(n):
         active = _argmax(log_alpha[k], 0)
@@ -248,7 +261,7 @@ def control_loop(
         command, target = commands[k], targets[k]
         prior, weight = (previous, 0.0) if controller == BASE_IK else (decoded[k], lambda_q)
         if controller != MILD and (contact[k] or controller == BASE_IK):
-            solve_ik_one(arm, target, prior, lambda_x, weight, command, scratch)
+            solve_ik_one(arm, target, prior, lambda_x, weight, terms, command, scratch)
         else:
             _copy(prior, command)
         for i in range(size):

@@ -22,6 +22,7 @@ TRAIN: dict[str, Any] = {
 } | {"epochs": int}
 """Every other key of a training config and its type: the parameters of `train`."""
 
+
 def make_options(values: Mapping[str, Any], where: str) -> TrainingOptions:
     """Options from converted values; an error in their range names the file."""
     try:

@@ -33,7 +33,10 @@ def rotate(w, x, y, z, vx, vy, vz):
 
 @njit(cache=True, fastmath=False)
 def arm_forward(arm, q, origins, directions, position):
-    """Forward kinematics: fills joint `origins` and `directions` (J, 3) and the end's `position` (3,)."""
+    """Forward kinematics: fills joint `origins` and `directions` (J, 3) and the end's `position` (3,).
+
+    Returns the end's rotation as a quaternion (wxyz); where nobody asks for it, it costs nothing.
+    """
     w, x, y, z, px, py, pz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     n = q.shape[0]
     for i in range(n + 1):
@@ -48,6 +51,7 @@ def arm_forward(arm, q, origins, directions, position):
         s, c = math.sin(0.5 * q[i]), math.cos(0.5 * q[i])
         w, x, y, z = multiply(w, x, y, z, c, s * ax, s * ay, s * az)
     position[0], position[1], position[2] = px, py, pz
+    return multiply(w, x, y, z, arm[n, 0], arm[n, 1], arm[n, 2], arm[n, 3])
 
 
 @njit(cache=True, fastmath=False)

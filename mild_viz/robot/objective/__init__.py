@@ -1,0 +1,1 @@
+"""What inverse kinematics minimises: Eq. ik-prior-simplified, and optional terms beside it."""
