@@ -117,6 +117,7 @@ class WebsocketOutput(Output):
         super().__init__(f"ws://{host_and_port(self._socket.getsockname())}", joint_names)
         # Small, so that a client who stops reading is noticed after a second or so, not after megabytes.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_WAITING)
+        self._socket.listen()  # from now on clients may come, though the thread takes a moment to start
         self._origins = [None, *(origin for origin in [address.options.get("origin")] if origin)]
         self._clients: set[ServerConnection] = set()
         self._queue: collections.deque[JointCommand] = collections.deque(maxlen=_QUEUED)
