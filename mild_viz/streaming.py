@@ -61,6 +61,8 @@ class Command(NamedTuple):
     log_alpha: Float[np.ndarray, " S"]
     log_transition: float
     active_state: int
+    human_latent_mean: Float[np.ndarray, " D"]
+    human_latent_std: Float[np.ndarray, " D"]
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
     joints_decoded: Float[np.ndarray, " J"]
@@ -125,6 +127,8 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
+        human_latent_mean=said.human_mean[0],
+        human_latent_std=said.human_std[0],
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
         joints_decoded=decoded[0],

@@ -23,6 +23,8 @@ def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Comma
         log_alpha=np.full(model.models[0].hmms[model.action].n_states, np.nan),
         log_transition=np.nan,
         active_state=-1,
+        human_latent_mean=np.full(size, np.nan),
+        human_latent_std=np.full(size, np.nan),
         robot_latent_mean=np.full(size, np.nan),
         robot_latent_covariance=np.full((size, size), np.nan),
         joints_decoded=np.full(len(joints), np.nan),
