@@ -60,6 +60,8 @@ class Decision:
     """Whether it answers an observation."""
     note: str = ""
     """Why the robot holds or returns, for people."""
+    T_world_person: Float[np.ndarray, "4 4"] | None = None
+    """The person's frame, where it had to be found in positions given in world."""
 
 
 @dataclass
@@ -83,6 +85,8 @@ class LiveController:
         self._lead: deque[Arm] = deque(maxlen=config.lead_frames(self.model.rate))
         self._references: deque[Float[np.ndarray, "4 3"]] = deque(maxlen=REFERENCES)
         self._last: tuple[float, Arm] | None = None
+        self._believed: tuple[float, Arm] | None = None
+        """The last whole arm that was plausible."""
         self._usable = -np.inf
 
     @property
@@ -143,13 +147,15 @@ class LiveController:
 
     def _plausible(self, time: float, arm: Arm) -> Arm:
         """The arm; NaN if a joint of it cannot have come there since the last one that was believed."""
-        if self._last is None or not np.isfinite(self._last[1]).all():
+        if not np.isfinite(arm).all():
             return arm
-        way = float(np.linalg.norm(arm - self._last[1], axis=1).max())
-        if not way > self.config.jump * (time - self._last[0]):
-            return arm
-        self.counts.implausible += 1
-        return np.full((3, 3), np.nan)
+        if self._believed is not None:
+            way = float(np.linalg.norm(arm - self._believed[1], axis=1).max())
+            if way > self.config.jump * (time - self._believed[0]):
+                self.counts.implausible += 1
+                return np.full((3, 3), np.nan)
+        self._believed = (time, arm)
+        return arm
 
     def _give_up(self, now: float) -> None:
         """End the interaction, or the waiting, with a person who is gone."""
@@ -200,4 +206,5 @@ class LiveController:
         return decision
 
     def _decide(self, command: Command, samples: tuple[Arm, ...], answers: bool, note: str) -> Decision:
-        return Decision(self.tracker.phase, self.interaction, command, samples, answers, note)
+        found = self.body.T_world_person if self.body.coordinates == "world" else None
+        return Decision(self.tracker.phase, self.interaction, command, samples, answers, note, found)

@@ -38,7 +38,7 @@ class Tick:
     """What happened in one turn of the loop."""
 
     time: float
-    """Since the loop began [s]: what the decision was made at."""
+    """`time.perf_counter()` [s]: what the decision was made at."""
     seen: Observation | None
     decision: Decision | None
     sent: JointCommand | None
@@ -68,21 +68,20 @@ class LiveLoop:
     faults: int = 0
     last_fault: str = ""
     _sequence: int = 0
-    _began: float = 0.0
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> None:
         """Control until stopped, until the input ends, or for so long [s]; then bring the arm back to rest."""
         config, period = self.controller.config, 1.0 / self.controller.model.rate
-        self._began = time.perf_counter()
         # A frame may be late: a command without one comes only when it is missed.
         patience = max(config.bridge, 1.5 * period)
-        due = self._began + patience
         ending: float | None = None
         with steady():
+            began = time.perf_counter()
+            due = began + patience
             while True:
                 now = time.perf_counter()
                 if ending is None and (
-                    stopped() or self.source.finished or (duration is not None and now - self._began >= duration)
+                    stopped() or self.source.finished or (duration is not None and now - began >= duration)
                 ):
                     ending = now
                     self._safely(self.controller.stop)
@@ -110,15 +109,14 @@ class LiveLoop:
     def _turn(self, seen: Observation | None, now: float) -> bool:
         """One decision and what follows from it; whether a command was sent."""
         decision, fault = None, ""
-        clock = now - self._began
         try:
             controller = self.controller
-            decision = controller.tick(clock) if seen is None else controller.observe(self._on_clock(seen), clock)
+            decision = controller.tick(now) if seen is None else controller.observe(seen, now)
         except Exception as error:
             fault = self._note(error)
         sent = None
         if decision is not None or fault:
-            sent = self._command(seen, decision, clock)
+            sent = self._command(seen, decision, now)
             try:
                 self.output.send(sent)
             except Exception as error:  # an output must not, but a robot must not pay for it
@@ -128,7 +126,7 @@ class LiveLoop:
         if seen is not None and sent is not None:
             whole = done - seen.received
             self.latency.add(done - now, whole)
-        tick = Tick(clock, seen, decision, sent, done - now, whole, fault)
+        tick = Tick(now, seen, decision, sent, done - now, whole, fault)
         for witness in self.witnesses:
             try:
                 witness(tick)
@@ -136,11 +134,7 @@ class LiveLoop:
                 self._note(error)
         return sent is not None
 
-    def _on_clock(self, seen: Observation) -> Observation:
-        """The observation with its arrival on the loop's own clock, so that a recorded one can be run again."""
-        return Observation(**{**vars(seen), "received": seen.received - self._began})
-
-    def _command(self, seen: Observation | None, decision: Decision | None, clock: float) -> JointCommand:
+    def _command(self, seen: Observation | None, decision: Decision | None, now: float) -> JointCommand:
         """The command that leaves: as decided and checked, or the last one again."""
         last, stiff = self.guard.last, np.ones(len(self.guard.last))
         phase, contact, fired = self.controller.tracker.phase, False, (FAULT,)
@@ -149,7 +143,7 @@ class LiveLoop:
             command = decision.command
             positions, stiff = command.joints_commanded, command.stiffness
             phase, contact, fired = decision.phase, command.contact, fired_names(decision)
-        positions, stiff = self.guard.check(positions, stiff, clock)
+        positions, stiff = self.guard.check(positions, stiff, now)
         self._sequence += 1
         return JointCommand(
             timestamp=time.time(),
