@@ -210,7 +210,7 @@ def test_endless_garbage_does_not_hold_the_reader(source: Input, send: Sender) -
         for _ in range(3):
             begin = time.perf_counter()
             assert source.poll(0.03) is None
-            assert time.perf_counter() - begin < 0.3
+            assert time.perf_counter() - begin < 2.0  # it would never return; the machine may be slow
     finally:
         stop.set()
         thread.join()
