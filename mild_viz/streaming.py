@@ -180,6 +180,7 @@ def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Comma
         size, n_states = model.models[0].human_vae.latent_size, model.controller.n_states
         nothing = {
             "log_alpha": np.full(n_states, np.nan), "log_transition": np.nan, "active_state": -1,
+            "human_latent_mean": np.full(size, np.nan), "human_latent_std": np.full(size, np.nan),
             "robot_latent_mean": np.full(size, np.nan), "robot_latent_covariance": np.full((size, size), np.nan),
             "joints_decoded": np.full(model.robot.chain.n_joints, np.nan), "target": np.full(3, np.nan),
         }  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 from mild_viz.errors import UserError
-from mild_viz.settings import WINDOW
+from mild_viz.settings import WINDOW, Watch
 from mild_viz.toml_config import check_keys, converted, read_toml
 
 
@@ -48,16 +48,17 @@ class LiveConfig:
     stale: float = 0.1
     """A frame that is older than this when its turn comes [s] is not used: three frames at 30 Hz, half of a human's
     reaction time."""
-    jump: float = 8.0
-    """Fastest that a joint of the arm can move [m/s]; a faster one is a tracking error, and taken as not tracked. Hands
-    in our recordings reach 4."""
     bridge: float = 0.1
     """Frames missing for up to this long are interpolated [s]; later ones count as not tracked."""
     clock: float = 0.5
     """If the sender's clock and ours differ by more than this over one frame [s], the sender's has jumped, and the time
     of arrival counts."""
-    gone: float = 2.0
-    """Without a usable frame for this long [s] the person is gone: the arm returns to rest. It holds until then."""
+    max_age: float = Watch.max_age
+    """The robot stops where it is when the person was last seen longer ago than this [s] (`settings.Watch`)."""
+    max_speed: float = Watch.max_speed
+    """A hand that moved faster than this between two frames has jumped, and the robot stops [m/s]."""
+    gone_after: float = Watch.gone_after
+    """Not seen for this long [s], the person is gone: the interaction ends and the arm returns to rest."""
     page_rate: float = 30.0
     """Most frames a second that the page is sent [Hz]."""
 
@@ -66,8 +67,14 @@ class LiveConfig:
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
                 raise UserError(f"{field.name} is {value!r}; valid: a finite number above 0")
-        if self.gone <= self.bridge:
-            raise UserError(f"gone is {self.gone} s and bridge {self.bridge} s; valid: gone above bridge")
+        if self.gone_after <= self.bridge:
+            raise UserError(f"gone_after is {self.gone_after} s, bridge {self.bridge} s; valid: gone_after above bridge")
+        _ = self.watch  # its own checks
+
+    @property
+    def watch(self) -> Watch:
+        """What the safety filter expects of the observations."""
+        return Watch(self.max_age, self.max_speed, self.gone_after)
 
     def lead_frames(self, rate: float) -> int:
         """Frames before the start that a model at `rate` [Hz] is given: at least its first window."""

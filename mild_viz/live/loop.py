@@ -20,6 +20,7 @@ from mild_viz.live.latency import Latency
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
 from mild_viz.live.outputs import Output
+from mild_viz.robot.control.rules import fired_rules
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +143,7 @@ class LiveLoop:
         if decision is not None:
             command = decision.command
             positions, stiff = command.joints_commanded, command.stiffness
-            phase, contact, fired = decision.phase, command.contact, fired_names(decision)
+            phase, contact, fired = decision.phase, command.contact, tuple(rule.name for rule in fired_rules(command.fired))
         positions, stiff = self.guard.check(positions, stiff, now)
         self._sequence += 1
         return JointCommand(
@@ -169,11 +170,6 @@ class LiveLoop:
         if self.faults <= LOGGED:
             log.exception("a fault in the control loop; the last command is held")
         return self.last_fault
-
-
-def fired_names(decision: Decision) -> tuple[str, ...]:
-    """Names of the rules that decided a command."""
-    return ("hold",) if not decision.answers and decision.phase == INTERACTING else ()
 
 
 _collected = False

@@ -24,7 +24,7 @@ from mild_viz.live.session import Session
 from mild_viz.pipeline import joint_log_alpha, state_visits
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import WINDOW, ControlSettings, Placement
+from mild_viz.settings import WINDOW, ControlSettings, Placement, Watch
 from mild_viz.streaming import StreamModel
 from mild_viz.trial import Dataset, Skeleton, Trial
 
@@ -86,10 +86,11 @@ def session_robot(session: Session, checkpoint: Checkpoint) -> RobotModel:
 def session_settings(session: Session) -> ControlSettings:
     """The settings of the controller in a session."""
     told = dict(session.header["control"])
-    placement, states = told.pop("placement"), told.pop("contact_states")
+    placement, states, watch = (told.pop(name) for name in ("placement", "contact_states", "watch"))
     try:
         return ControlSettings(
             **told,
+            watch=Watch(**watch),
             placement=None if placement is None else Placement(**placement),
             contact_states=None if states is None else frozenset(states),
         )
@@ -140,6 +141,7 @@ def session_trial(session: Session, number: int, index: int) -> Trial:
     stand at the end, where a recording has the ones that are predicted.
     """
     samples = np.array([sample for tick in interactions(session)[number] for sample in _decision(tick).samples])
+    names = tuple(session.header["robot"]["joint_names"])
     return Trial(
         dataset=DATASET,
         split="test",
@@ -147,6 +149,8 @@ def session_trial(session: Session, number: int, index: int) -> Trial:
         action=session.header["action"],
         rate=session.header["rate"],
         human_arm=np.concatenate([samples, np.repeat(samples[-1:], WINDOW, axis=0)]),
+        robot_joints=np.full((len(samples) + WINDOW, len(names)), np.nan),  # nobody showed what to do instead
+        robot_joint_names=names,
     )
 
 
@@ -199,6 +203,7 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
         human_hand=to_frame(T_world_human, target),
         human_skeleton=_skeleton(ticks),
     )
+    model_rules = checkpoint.contact_rules_of(header["action"])
     durations, occupancy = state_visits(active, inference.n_states, inference.rate)
     placement = settings.placement or checkpoint.placement
     shoulder = T_world_human[:3, 3] - robot.chain.shoulder
@@ -214,6 +219,8 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
         hand_distance=np.linalg.norm(end_effector - target, axis=1),
         contact=np.array([tick.sent.contact for tick in ticks if tick.sent is not None]),
         stiffness=np.array([tick.sent.stiffness for tick in ticks if tick.sent is not None]),
+        compliant=model_rules.compliant,
+        fired=np.array([each.fired for each in said]),
         T_world_human=T_world_human,
         link_names=robot.link_names,
         link_poses=robot.link_poses(commanded, inference.action),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -19,15 +21,12 @@ from mild_viz.trial import Trial
 NOMINAL_ARM = np.array([[0.0, -0.18, 0.0], [0.03, -0.20, -0.28], [0.12, -0.20, -0.52]])
 """Shoulder, elbow and wrist of an adult whose arm hangs [m], where a model knows nobody's."""
 
-SPEED = 8.0
-"""Largest speed of a joint whose limit is not known [rad/s]."""
-
-
 def live_model(
-    checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel, settings: ControlSettings
+    checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel, settings: ControlSettings, config: LiveConfig
 ) -> StreamModel:
     """The model that live operation runs, at its own rate. Raises UserError for a variant or action it lacks."""
     rate = checkpoint.rate or UNKNOWN_RATE
+    settings = replace(settings, watch=config.watch)
     placement = live_placement(checkpoint, robot, settings)
     return stream_model(checkpoint, variant, action, robot, settings, T_world_human(robot.chain, placement), rate)
 
@@ -43,10 +42,10 @@ def live_placement(checkpoint: Checkpoint, robot: RobotModel, settings: ControlS
     return outstretched_placement(robot.chain, nominal)
 
 
-def make_guard(robot: RobotModel) -> Guard:
-    """The last check of this robot's commands."""
-    chain = robot.chain
-    return Guard(chain.lower, chain.upper, np.full(chain.n_joints, SPEED), chain.rest)
+def make_guard(model: StreamModel) -> Guard:
+    """The last check of this model's commands: the robot's own limits, without the safety filter's margins."""
+    chain, limits = model.robot.chain, model.controller.limits
+    return Guard(chain.lower, chain.upper, limits.velocity, limits.rest)
 
 
 def warm_up(model: StreamModel, config: LiveConfig) -> None:

@@ -44,6 +44,14 @@ class ControlCarry(NamedTuple):
         """Time since an observation that was one to go by [s]."""
         return float(self.clock[0])
 
+    def dismissed(self) -> ControlCarry:
+        """As if the human had been gone for ever: the arm returns to rest until the next observation."""
+        return self._replace(clock=np.concatenate([[np.inf], self.clock[1:]]))
+
+    def paused(self, before: ControlCarry) -> ControlCarry:
+        """What was learnt of the human since `before`, with the arm as it was then: no command was sent meanwhile."""
+        return self._replace(motion=before.motion, clock=before.clock)
+
 
 class Frames(NamedTuple):
     """What N frames give the controller."""
