@@ -126,7 +126,9 @@ def main(minutes: float = 30.0) -> None:
     for dataset, rest in (("demo", 0.0), ("nuisi", 1.0)):
         report_starts(dataset, rest, config)
     report_rest(minutes, config)
-    print(f"\nmean squared error [rad^2] from the start to the end; the model begins so many frames before: {LEADS}, all")
+    print(
+        f"\nmean squared error [rad^2] from the start to the end; the model begins so many frames before: {LEADS}, all"
+    )
     for dataset, rest in (("demo", 0.0), ("nuisi", 1.0)):
         checkpoint = load_checkpoint(default_checkpoint(dataset))
         for variant in ("v3.1", "v3.2", "v4"):

@@ -68,7 +68,9 @@ class LiveConfig:
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
                 raise UserError(f"{field.name} is {value!r}; valid: a finite number above 0")
         if self.gone_after <= self.bridge:
-            raise UserError(f"gone_after is {self.gone_after} s, bridge {self.bridge} s; valid: gone_after above bridge")
+            raise UserError(
+                f"gone_after is {self.gone_after} s, bridge {self.bridge} s; valid: gone_after above bridge"
+            )
         _ = self.watch  # its own checks
 
     @property

@@ -5,8 +5,6 @@ Independent of the safety filter and of how the command came about. On a sound c
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from jaxtyping import Float
 

@@ -68,7 +68,8 @@ class LiveLoop:
     latency: Latency = field(default_factory=Latency)
     faults: int = 0
     last_fault: str = ""
-    _sequence: int = 0
+    sent: int = 0
+    """Commands that left; the last one's sequence number."""
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> None:
         """Control until stopped, until the input ends, or for so long [s]; then bring the arm back to rest."""
@@ -143,12 +144,16 @@ class LiveLoop:
         if decision is not None:
             command = decision.command
             positions, stiff = command.joints_commanded, command.stiffness
-            phase, contact, fired = decision.phase, command.contact, tuple(rule.name for rule in fired_rules(command.fired))
+            phase, contact, fired = (
+                decision.phase,
+                command.contact,
+                tuple(rule.name for rule in fired_rules(command.fired)),
+            )
         positions, stiff = self.guard.check(positions, stiff, now)
-        self._sequence += 1
+        self.sent += 1
         return JointCommand(
             timestamp=time.time(),
-            sequence=self._sequence,
+            sequence=self.sent,
             observed=None if seen is None or fired == (FAULT,) else seen.timestamp,
             joint_names=self.controller.model.robot.chain.joint_names,
             positions=positions,

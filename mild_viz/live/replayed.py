@@ -126,9 +126,7 @@ def session_dataset(session: Session) -> Dataset:
     Raises:
         UserError: if it holds none.
     """
-    trials = tuple(
-        session_trial(session, number, index) for index, number in enumerate(interactions(session))
-    )
+    trials = tuple(session_trial(session, number, index) for index, number in enumerate(interactions(session)))
     if not trials:
         raise UserError(f"{session.path} holds no interaction: the hand never left its resting place")
     return Dataset(DATASET, f"Live session {session.path.name}", (), trials, session.header["checkpoint"]["checksum"])

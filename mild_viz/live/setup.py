@@ -8,18 +8,22 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
+from mild_viz.live.address import parse
 from mild_viz.live.config import LiveConfig
 from mild_viz.live.controller import LiveController
 from mild_viz.live.guard import Guard
+from mild_viz.live.inputs import INPUTS
+from mild_viz.live.replay import find_trial
 from mild_viz.prediction import UNKNOWN_RATE
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import T_world_human, outstretched_placement
-from mild_viz.settings import ControlSettings, Placement
+from mild_viz.settings import ControlSettings, Placement, choose
 from mild_viz.streaming import StreamModel, start, step, stream_model
 from mild_viz.trial import Trial
 
 NOMINAL_ARM = np.array([[0.0, -0.18, 0.0], [0.03, -0.20, -0.28], [0.12, -0.20, -0.52]])
 """Shoulder, elbow and wrist of an adult whose arm hangs [m], where a model knows nobody's."""
+
 
 def live_model(
     checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel, settings: ControlSettings, config: LiveConfig
@@ -70,3 +74,31 @@ def rehearsal_arms(rate: float, config: LiveConfig) -> Float[np.ndarray, "N 3 3"
     rest = round((config.calibration + 0.5) * rate) + 10
     share = np.concatenate([np.zeros(rest), np.linspace(0.0, 1.0, round(rate))])
     return NOMINAL_ARM + share[:, None, None] * np.array([[0, 0, 0], [0.15, 0, 0.1], [0.4, 0, 0.4]])
+
+
+REST = 1.0
+"""Seconds of rest before a trial that is replayed, where nothing else is asked for."""
+
+
+def rested(source: str) -> str:
+    """The address of an input; a trial that is replayed begins with some rest, as a person does who is met."""
+    address = parse(source, "input", INPUTS)
+    if address.scheme != "replay" or "rest" in address.options:
+        return source
+    return f"{source}{'&' if '?' in source else '?'}rest={REST:g}"
+
+
+def choose_dataset(asked: str | None, source: str) -> str:
+    """The dataset whose shipped model is used: as asked, else the one that is replayed, else demo."""
+    address = parse(source, "input", INPUTS)
+    return asked or (address.place.split("/")[0] if address.scheme == "replay" else "demo")
+
+
+def choose_action(asked: str | None, source: str, checkpoint: Checkpoint) -> str:
+    """The interaction: as asked, else that of the trial that is replayed, else a handshake, else the model's first."""
+    if asked is not None:
+        return choose(f"checkpoint {checkpoint.name}: action", asked, checkpoint.actions)
+    address = parse(source, "input", INPUTS)
+    if address.scheme == "replay":
+        return find_trial(address.place).action
+    return "handshake" if "handshake" in checkpoint.actions else checkpoint.actions[0]
