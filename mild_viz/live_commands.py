@@ -197,7 +197,7 @@ def report(console: Console, loop: LiveLoop, recorder: Recorder | None, page: Pa
     if latency.count:
         for name, times in (("computing", latency.computing()), ("frame to command", latency.whole())):
             numbers = [f"{1e3 * value:.2f}" for value in (times.median, times.p99, times.longest)]
-            row(f"{name} [ms]: median / 99 % / longest", *numbers)
+            row(f"{name} in ms: median / 99 % / longest", *numbers)
     row("answers timed", latency.count)
     row("frames received / used", seen.received, seen.delivered)
     row("rejected / late / repeated", seen.rejected, seen.reordered, seen.duplicated)

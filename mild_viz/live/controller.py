@@ -17,6 +17,7 @@ from mild_viz.live.messages import Observation
 from mild_viz.live.onset import CALIBRATING, INTERACTING, RETURNING, WAITING, PhaseTracker
 from mild_viz.live.pace import Clock, Pace
 from mild_viz.live.person import Body
+from mild_viz.robot.control.rules import GONE, MISSING
 from mild_viz.streaming import Command, StreamModel
 
 Arm = Float[np.ndarray, "3 3"]
@@ -184,6 +185,8 @@ class LiveController:
         """Bring the arm back to rest, or keep it there."""
         self.carry = self.carry._replace(control=self.carry.control.dismissed())
         self.carry, command = streaming.idle(self.model, self.carry, self._elapsed(now))
+        if now - self._usable <= self.config.gone_after:  # sent to rest, but not because nobody is there
+            command = command._replace(fired=command.fired & ~(1 << MISSING | 1 << GONE))
         note = self.tracker.reason if self.tracker.phase == RETURNING else ""
         decision = self._decide(now, command, (), answers, note)
         if self.at_rest:

@@ -22,8 +22,8 @@ class ReplayInput(Input):
     """The person of one trial, in the person's own frame; the clock starts at the first `poll`.
 
     Timestamps are seconds since then. `rate` [Hz] samples the recorded motion anew (linearly, lost where either
-    neighbour is); `speed` makes it faster; `loop` starts it over at its end, without a pause. `rest` [s] holds the first
-    frame so long before: recordings may begin with the reach, while a person who is met stands there first.
+    neighbour is); `speed` makes it faster; `loop` starts it over at its end, without a pause. `rest` [s] holds the
+    first frame so long before: recordings may begin with the reach, while a person who is met stands there first.
     """
 
     def __init__(self, address: Address) -> None:

@@ -1,4 +1,4 @@
-"""What a recorded session becomes: rollouts as they were, trials to run with other settings, and the run itself again."""
+"""What a recorded session becomes: rollouts as they were, trials for other settings, and the run itself again."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
         joint_names=robot.chain.joint_names,
         time=np.array([tick.time for tick in ticks]) - ticks[0].time,
         observed=np.isfinite(human_mean).all(1) & np.array([tick_taken(tick) for tick in ticks]),
-        tracked=np.isfinite(arms).all(axis=(1, 2)),
+        tracked=np.isfinite(arms.reshape(n_rows, -1)).all(axis=1),
         log_alpha_human=np.array([each.log_alpha for each in said]),
         log_alpha_joint=joint_log_alpha(model, header["action"], human_mean, np.full_like(human_mean, np.nan)),
         log_alpha_unobserved=unobserved_forward(hmm, n_rows),

@@ -1,4 +1,4 @@
-"""A live session as a file: one JSON object a line, appended as it happens, so that a crash loses the last line at most.
+"""A live session as a file: one JSON object a line, appended as it happens: a crash loses the last line at most.
 
 The first line says what ran (`header`), every further one is a turn of the control loop: what was observed, what the
 model said, what was decided and sent, how long it took. Numbers are exact: the shortest text that reads back as the
@@ -149,10 +149,10 @@ def _header(record: dict[str, Any], where: str) -> dict[str, Any]:
     return record
 
 
-def _array(value: Any, *shape: int | None) -> np.ndarray:
-    """Numbers back from JSON; `shape` where it is known, None for any length."""
+def _array(value: Any, *shape: int) -> np.ndarray:
+    """Numbers back from JSON; `shape` where it is known."""
     array = np.array(_numbers(value), dtype=np.float64)
-    if shape and (array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape))):
+    if shape and (array.ndim != len(shape) or any(n != m for n, m in zip(shape, array.shape, strict=True))):
         raise ValueError(f"shape {array.shape}")
     return array
 
@@ -201,7 +201,9 @@ def _seen(seen: dict[str, Any], names: tuple[str, ...]) -> Observation:
 
 def _decision(decision: dict[str, Any], n_joints: int) -> Decision:
     said = decision["command"]
-    values = {name: _scalar(said[name], SCALARS[name]) if name in SCALARS else _array(said[name]) for name in said}
+    values: dict[str, Any] = {
+        name: _scalar(said[name], SCALARS[name]) if name in SCALARS else _array(said[name]) for name in said
+    }
     command = Command(**values)
     if command.joints_commanded.shape != (n_joints,):
         raise ValueError(f"{command.joints_commanded.shape} joints")
