@@ -108,7 +108,7 @@ def control(
     placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
     target = in_frame(placed.T_world_human, inference.human_hand)
     rules = checkpoint.contact_rules_of(inference.action)
-    controller = make_controller(robot.chain, settings, rules, inference.n_states)
+    controller = make_controller(robot, settings, rules, inference.n_states, inference.rate)
     crossing = inference.log_transition if uses_transition(settings, transition) else None
     frames = Frames(
         log_alpha=inference.log_alpha_human,

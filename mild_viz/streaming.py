@@ -111,7 +111,7 @@ def stream_model(
         action=action,
         robot=robot,
         settings=settings,
-        controller=make_controller(robot.chain, settings, checkpoint.contact_rules_of(action), checkpoint.n_states),
+        controller=make_controller(robot, settings, checkpoint.contact_rules_of(action), checkpoint.n_states, rate),
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,

@@ -10,7 +10,7 @@ from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.control.controller import Controller, Frames
 from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.control.safety import Limits
-from mild_viz.robot.control.stiffness import StiffnessRange
+from mild_viz.robot.spec import StiffnessSpec
 from mild_viz.settings import ControlSettings, Watch
 
 RATE = 30.0
@@ -28,7 +28,7 @@ def unhindered(chain: ArmChain, settings: ControlSettings, action: str, n_states
     """The rules of an action, with nothing that takes time: no rates, and nobody is ever gone."""
     rules = replace(DEFAULT_RULES[action], stiffness_fall=1e3, stiffness_rise=1e3)
     settings = replace(settings, watch=Watch(1e9, 1e9, 1e9))
-    return Controller(chain, settings, rules, n_states, wide_limits(chain), StiffnessRange(rate=1e3))
+    return Controller(chain, settings, rules, n_states, RATE, wide_limits(chain), StiffnessSpec(rate=1e3))
 
 
 def frames(
@@ -45,7 +45,7 @@ def frames(
         log_transition=np.full(n, -np.inf) if log_transition is None else log_transition,
         decoded=decoded,
         targets=targets,
-        tracked=np.isfinite(targets).all(axis=1),
+        tracked=np.asarray(np.isfinite(targets).all(axis=1)),
         seconds=np.full(n, 1.0 / RATE) if seconds is None else seconds,
     )
 

@@ -50,6 +50,8 @@ class StiffnessSpec:
 
     lowest: float = 0.0
     highest: float = 1.0
+    rate: float = 10.0
+    """Fastest change [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,9 @@ class SafetySpec:
 
     margin: float = 0.01
     """Distance that a command keeps from the limits of position [rad]."""
-    acceleration: float = 20.0
-    """Largest acceleration of every joint [rad/s^2]."""
+    acceleration: float | None = None
+    """Largest acceleration of every joint [rad/s^2]; None: what gets it to its largest speed in
+    `control.safety.RISE_TIME`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,12 +186,14 @@ def _stiffness(value: Any, where: str) -> StiffnessSpec:
     spec = StiffnessSpec(**_fields(value, get_type_hints(StiffnessSpec), where))
     if not 0.0 <= spec.lowest <= spec.highest <= 1.0:
         raise UserError(f"{where} is {spec.lowest} to {spec.highest}; valid: 0 <= lowest <= highest <= 1")
+    if not spec.rate > 0.0:
+        raise UserError(f"{where}: rate is {spec.rate}; valid: above 0 a second")
     return spec
 
 
 def _safety(value: Any, where: str) -> SafetySpec:
     spec = SafetySpec(**_fields(value, get_type_hints(SafetySpec), where))
-    if not (0.0 <= spec.margin <= 0.5 and spec.acceleration > 0.0):
+    if not (0.0 <= spec.margin <= 0.5 and (spec.acceleration is None or spec.acceleration > 0.0)):
         raise UserError(f"{where}: margin is {spec.margin}, acceleration {spec.acceleration}; valid: a margin of 0 to "
                         "0.5 rad, an acceleration above 0 rad/s^2")  # fmt: skip
     return spec

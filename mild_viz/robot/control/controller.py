@@ -17,7 +17,9 @@ from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain, kernel_array
 from mild_viz.robot.control.rules import ContactRules
 from mild_viz.robot.control.safety import Limits, limits_of
-from mild_viz.robot.control.stiffness import StiffnessRange, stiffness_schedule
+from mild_viz.robot.control.stiffness import stiffness_schedule
+from mild_viz.robot.model import RobotModel
+from mild_viz.robot.spec import StiffnessSpec
 from mild_viz.settings import CONTROLLERS, ControlSettings
 
 MAX_STATES = 62
@@ -107,11 +109,13 @@ class Controller:
     """With the contact states filled in."""
     rules: ContactRules
     n_states: int
+    rate: float
+    """Observations a second [Hz]."""
     limits: Limits
-    stiffness: StiffnessRange = StiffnessRange()
+    stiffness: StiffnessSpec = StiffnessSpec()
 
     @cached_property
-    def packed(self) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "11"], Float[np.ndarray, "5 J"]]:
+    def packed(self) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "12"], Float[np.ndarray, "5 J"]]:
         """Choices, numbers and limits as `kernels` takes them; `UserError` for a contact state that does not exist."""
         settings, rules, limits, watch = self.settings, self.rules, self.limits, self.settings.watch
         schedule = stiffness_schedule(rules, settings.stiffness, self.stiffness)
@@ -129,7 +133,7 @@ class Controller:
             [
                 *(settings.lambda_x, settings.lambda_q, settings.smoothing, rules.ik_doubt),
                 *schedule,
-                *(watch.max_age, watch.max_speed, watch.gone_after),
+                *(watch.max_age, watch.max_speed, watch.gone_after, 1.0 / self.rate),
             ]
         )
         rows = (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.rest)
@@ -182,9 +186,12 @@ class Controller:
         return self.run(nothing, carry)
 
 
-def make_controller(chain: ArmChain, settings: ControlSettings, rules: ContactRules, n_states: int) -> Controller:
-    """The controller of an arm, with the arm's own limits."""
-    return Controller(chain, settings, rules, n_states, limits_of(chain))
+def make_controller(
+    robot: RobotModel, settings: ControlSettings, rules: ContactRules, n_states: int, rate: float
+) -> Controller:
+    """The controller of a robot's interacting arm, with the robot's own limits."""
+    limits = limits_of(robot.chain, robot.spec.safety)
+    return Controller(robot.chain, settings, rules, n_states, rate, limits, robot.spec.stiffness)
 
 
 def state_mask(states: frozenset[int], n_states: int) -> int:

@@ -21,7 +21,7 @@ BASE_IK, MILD, MILD_IK = 0, 1, 2
 CONTROLLER, CONTACT_STATES, COMPLIANT, NO_RETURN, IK_CROSSED = 0, 1, 2, 3, 4
 """Slots of the choices, whole numbers; contact states are a bit mask."""
 
-LAMBDA_X, LAMBDA_Q, SMOOTHING, DOUBT, FREE, SOFT, FALL, RISE, MAX_AGE, MAX_SPEED, GONE_AFTER = range(11)
+LAMBDA_X, LAMBDA_Q, SMOOTHING, DOUBT, FREE, SOFT, FALL, RISE, MAX_AGE, MAX_SPEED, GONE_AFTER, PERIOD = range(12)
 """Slots of the numbers."""
 
 LOW, HIGH, VELOCITY, ACCELERATION, REST = 0, 1, 2, 3, 4
@@ -182,7 +182,7 @@ def _watch(numbers, tracked, target, seconds, hand, clock):
         apart = 0.0
         for i in range(3):
             apart += (target[i] - hand[i]) ** 2
-        if not math.sqrt(apart) <= numbers[MAX_SPEED] * clock[UNSEEN]:
+        if not math.sqrt(apart) <= numbers[MAX_SPEED] * max(clock[UNSEEN], numbers[PERIOD]):
             return 1 << rules.JUMPED, False
     _copy(target, hand)
     clock[AGE] = clock[UNSEEN] = 0.0

@@ -20,11 +20,8 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
+from mild_viz.robot.spec import SafetySpec
 from mild_viz.trial import freeze_arrays
-
-MARGIN = 0.01
-"""Commands keep this far from a joint's limits [rad], half a degree: what controllers overshoot. The resting posture,
-and joints that hardly move, are inside all the same."""
 
 UNSTATED_VELOCITY = 3.14
 """Largest speed of a joint whose description states none [rad/s]: half a turn a second."""
@@ -61,15 +58,18 @@ class Limits:
         freeze_arrays(self)
 
 
-def limits_of(chain: ArmChain, acceleration: Float[np.ndarray, " J"] | None = None, margin: float = MARGIN) -> Limits:
-    """The limits of an arm [rad, rad/s, rad/s^2]. Velocities are those of the description."""
+def limits_of(chain: ArmChain, spec: SafetySpec) -> Limits:
+    """The limits of an arm [rad, rad/s, rad/s^2]: its description's, and its robot's margin and acceleration.
+
+    The resting posture is inside, and so is the middle half of a joint that hardly moves.
+    """
     rest = np.clip(chain.rest, chain.lower, chain.upper)
-    margins = np.minimum(margin, 0.25 * (chain.upper - chain.lower))
+    margins = np.minimum(spec.margin, 0.25 * (chain.upper - chain.lower))
     velocity = np.where(np.isfinite(chain.velocity), chain.velocity, UNSTATED_VELOCITY)
     return Limits(
         np.minimum(chain.lower + margins, rest),
         np.maximum(chain.upper - margins, rest),
         velocity,
-        velocity / RISE_TIME if acceleration is None else np.asarray(acceleration, dtype=float),
+        velocity / RISE_TIME if spec.acceleration is None else np.full(chain.n_joints, spec.acceleration),
         rest,
     )

@@ -5,18 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from mild_viz.robot.control.rules import ContactRules
-
-FREE_STIFFNESS = 1.0
-"""Fraction of full joint stiffness in free motion."""
-
-
-class StiffnessRange(NamedTuple):
-    """What a robot's joints take."""
-
-    lowest: float = 0.0
-    highest: float = FREE_STIFFNESS
-    rate: float = 10.0
-    """Fastest change [1/s]."""
+from mild_viz.robot.spec import StiffnessSpec
 
 
 class StiffnessSchedule(NamedTuple):
@@ -28,7 +17,7 @@ class StiffnessSchedule(NamedTuple):
     rise: float
 
 
-def stiffness_schedule(rules: ContactRules, enabled: bool, limits: StiffnessRange) -> StiffnessSchedule:
+def stiffness_schedule(rules: ContactRules, enabled: bool, limits: StiffnessSpec) -> StiffnessSchedule:
     """What the rules of an action ask for, within what the robot takes."""
     free = limits.highest
     contact = min(max(rules.stiffness, limits.lowest), free) if enabled and rules.compliant else free
