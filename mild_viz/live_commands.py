@@ -93,6 +93,7 @@ def live(
     dataset = choose_dataset(run.dataset, input)
     checkpoint, robot = run.load(dataset)
     action = choose_action(run.action, input, checkpoint)
+    thresholds = thresholds.for_dataset(checkpoint.dataset)
     model = live_model(checkpoint, run.variant, action, robot, run.settings(), thresholds)
     source = open_input(rested(input))
     closing: list[Any] = [source]

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import get_type_hints
 
 from mild_viz.errors import UserError
 from mild_viz.settings import WINDOW, Watch
 from mild_viz.toml_config import check_keys, converted, read_toml
+
+RESTS = {"demo": 0.97, "nuisi": 0.2, "handover": 0.07, "yumi": 2.0}
+"""How long the training trials of a dataset go on before this module's thresholds see a start [s], in the median. By
+benchmarks/onset.py, v3 models hardly care; the v4 model of demo errs by 0.027 rad^2 with it and 0.039 with 0.17 s."""
+
+USUAL_REST = 0.3
+"""For any other dataset [s]."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +37,9 @@ class LiveConfig:
     """For how long it must be there [s]: one frame more at 30 Hz, so that one frame's tracking error starts nothing."""
     adaptation: float = 10.0
     """Time constant with which the resting place follows a hand that rests [s]: who shifts weight starts nothing."""
-    lead: float = 0.5
-    """How much of the time before the start the model is given [s]: recordings begin at rest, so that a filter that
-    began in the middle of the reach would begin in a state it never began in. See benchmarks/onset.py."""
+    lead: float | None = None
+    """How much of the time before the start the model is given [s]: recordings begin at rest, and a v4 model counts the
+    time from there. None: as long as the model's own recordings rest (`RESTS`); at least its first window."""
     end_distance: float = 0.071
     """The hand is back when it is this near to its resting place [m]; the authors' 0.005 m^2, squared."""
     end_duration: float = 0.3
@@ -65,12 +72,12 @@ class LiveConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "lead" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
                 raise UserError(f"{field.name} is {value!r}; valid: a finite number above 0")
         if self.gone_after <= self.bridge:
-            raise UserError(
-                f"gone_after is {self.gone_after} s, bridge {self.bridge} s; valid: gone_after above bridge"
-            )
+            raise UserError(f"gone_after is {self.gone_after} s; valid: above bridge, {self.bridge} s")
         _ = self.watch  # its own checks
 
     @property
@@ -78,9 +85,13 @@ class LiveConfig:
         """What the safety filter expects of the observations."""
         return Watch(self.max_age, self.max_speed, self.gone_after)
 
+    def for_dataset(self, dataset: str) -> LiveConfig:
+        """With the lead of a model that was trained on a dataset, where none is chosen."""
+        return self if self.lead is not None else replace(self, lead=RESTS.get(dataset, USUAL_REST))
+
     def lead_frames(self, rate: float) -> int:
-        """Frames before the start that a model at `rate` [Hz] is given: at least its first window."""
-        return max(round(self.lead * rate), WINDOW)
+        """Frames before the start that a model at `rate` [Hz] is given."""
+        return max(round((USUAL_REST if self.lead is None else self.lead) * rate), WINDOW)
 
 
 def read_live_config(file: Path) -> LiveConfig:

@@ -14,6 +14,9 @@ SLACK = 1e-9
 """What rounding may add to a limit [rad]."""
 
 
+LEAST_SECONDS = 1e-3
+"""A command that follows sooner [s] repeats the last one; its time counts for the next."""
+
 MOST_SECONDS = 0.2
 """However long nothing was sent, a command is so much time's way from the last one at most [s]."""
 
@@ -38,7 +41,10 @@ class Guard:
         the last."""
         elapsed = MOST_SECONDS if self._sent is None else now - self._sent
         step = self._velocity * min(max(elapsed, 0.0), MOST_SECONDS) + SLACK
-        self._sent = now
+        if elapsed >= LEAST_SECONDS:
+            self._sent = now
+        else:
+            step = np.zeros_like(step)
         wanted = np.where(np.isfinite(positions), positions, self._last)
         allowed = np.clip(wanted, self._last - step, self._last + step)
         allowed = np.clip(allowed, self._lower, self._upper)
