@@ -88,7 +88,7 @@ def test_live_gives_the_commands_of_the_stream(variant: str, handshake: Trial) -
 
 
 def test_live_gives_what_the_pipeline_gives(model: StreamModel, handshake: Trial) -> None:
-    """The filter begins `lead` before the start, not at the first frame, and the arm at rest: both are soon forgotten."""
+    """The filter begins `lead` before the start, not with the trial, and the arm at rest: both are soon forgotten."""
     checkpoint, robot = load_checkpoint(default_checkpoint("demo")), load_robot("pepper")
     trial = replace(handshake, T_world_human=None, T_world_partner=None)  # live, nobody knows where the partner stood
     rollout = control(infer(checkpoint, trial, "v3.1"), checkpoint, robot, trial, ControlSettings())

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -53,10 +52,8 @@ class Tick:
     fault: str = ""
 
 
-class Witness(Protocol):
-    """Whoever is told of every tick, in the control thread: must neither wait nor raise."""
-
-    def __call__(self, tick: Tick) -> None: ...
+Witness = Callable[[Tick], None]
+"""Whoever is told of every tick, in the control thread: must neither wait nor raise."""
 
 
 @dataclass
