@@ -94,7 +94,7 @@ def live(
     checkpoint, robot = run.load(dataset)
     action = choose_action(run.action, input, checkpoint)
     thresholds = thresholds.for_dataset(checkpoint.dataset)
-    model = live_model(checkpoint, run.variant, action, robot, run.settings(), thresholds)
+    model = live_model(checkpoint, run.variant or checkpoint.default_variant, action, robot, run.settings(), thresholds)
     source = open_input(rested(input))
     closing: list[Any] = [source]
     console = Console()
@@ -102,15 +102,14 @@ def live(
     try:
         sink = open_output(output, robot.chain.joint_names)
         closing.append(sink)
-        robot_source = run.robot or checkpoint.for_robot().name
         if record is not None:
             names = (source.name, sink.name)
-            recorder = Recorder(record, session_header(checkpoint, model, robot_source, thresholds, names))
+            recorder = Recorder(record, session_header(checkpoint, model, run.robot, thresholds, names))
             closing.append(recorder)
         loop = LiveLoop(LiveController(model, thresholds), source, sink, make_guard(model))
         shown = None
         if page:
-            shown = open_page(loop, recorder, checkpoint.path, robot_source, host, port, source.name, sink.name)
+            shown = open_page(loop, recorder, checkpoint.path, run.robot, host, port, source.name, sink.name)
             closing.append(shown)
         warm_up(model, thresholds)
         loop.witnesses = tuple(witness for witness in (recorder, shown) if witness is not None)
@@ -123,7 +122,7 @@ def live(
 
 
 def open_page(
-    loop: LiveLoop, recorder: Recorder | None, checkpoint: Path, robot: str, host: str, port: int, source: str,
+    loop: LiveLoop, recorder: Recorder | None, checkpoint: Path, robot: str | None, host: str, port: int, source: str,
     output: str,
 ) -> PageProcess:  # fmt: skip
     """Start the page's process and wait until it stands. Raises UserError where it does not, such as a taken port."""
@@ -137,8 +136,6 @@ def open_page(
         variant=model.variant,
         action=model.action,
         robot=robot,
-        joint_names=model.robot.chain.joint_names,
-        end_effector=model.robot.chain.end_effector,
         settings=model.settings,
         T_world_human=model.T_world_human,
         config=config,

@@ -73,7 +73,7 @@ class ModelOptions:
 
     Attributes:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        variant: Variant of MILD. Example: --variant v2.1
+        variant: Variant of MILD. Default: v3.1, or the first one of a model without it. Example: --variant v2.1
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
             model). Example: --controller mild
@@ -87,12 +87,13 @@ class ModelOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. Default: the robot that the model
-            was trained for. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. A model of a second human
+            (nuisi-human, handover-human) moves any of them. Default: the robot that the model was trained for, or
+            that of its dataset. Example: --robot ~/pepper.urdf
     """
 
     checkpoint: OptionalPath = None
-    variant: VariantName = "v3.1"
+    variant: OptionalVariant = None
     controller: ControllerName = "mild-ik"
     contact_states: OptionalStates = None
     lambda_x: float = 1.0
@@ -119,11 +120,10 @@ class ModelOptions:
     def load(self, dataset: str) -> tuple[Checkpoint, RobotModel]:
         """The model, by default the one that ships for a dataset, and its robot, or the chosen one."""
         from mild_viz.checkpoint import load_checkpoint
-        from mild_viz.robot.model import load_robot
+        from mild_viz.decoding import open_robot
 
         checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(dataset))
-        interface = checkpoint.for_robot()
-        return checkpoint, load_robot(self.robot or interface.name, interface.joint_names, interface.end_effector)
+        return checkpoint, open_robot(checkpoint, self.robot)
 
 
 @documented
@@ -148,4 +148,5 @@ class RunOptions(ModelOptions):
 
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
         checkpoint, robot = self.load(self.dataset)
-        return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, self.settings()), robot
+        inference = infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot)
+        return control(inference, checkpoint, robot, trial, self.settings()), robot

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
+from mild_viz.decoding import Decoding, decoding_of
 from mild_viz.errors import UserError
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
 from mild_viz.pairs import rates_differ
@@ -34,6 +35,7 @@ class StreamModel:
     variant: str
     action: str
     robot: RobotModel
+    decoding: Decoding
     settings: ControlSettings
     controller: Controller
     uses_transition: bool
@@ -57,6 +59,8 @@ class Carry(NamedTuple):
     previous: Float[np.ndarray, " 9"] | None
     """The previous frame's filled position."""
     models: tuple[ModelCarry, ...]
+    decoding: Float[np.ndarray, " J"]
+    """The last decoded joints."""
     control: ControlCarry
     command: Command | None
     """The last command."""
@@ -110,6 +114,7 @@ def stream_model(
         variant=variant,
         action=action,
         robot=robot,
+        decoding=decoding_of(checkpoint, robot, rate),
         settings=settings,
         controller=make_controller(robot, settings, checkpoint.contact_rules_of(action), checkpoint.n_states, rate),
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
@@ -123,7 +128,7 @@ def start(model: StreamModel) -> Carry:
     """The state before the first observation: the robot rests."""
     empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, model.controller.start(), None)
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), model.controller.start(), None)
 
 
 def step(
@@ -142,7 +147,7 @@ def step(
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
-    decoded = said.decoded[:, : len(model.robot.chain.joint_names)]
+    decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     frames = Frames(
         log_alpha=said.log_alpha,
@@ -165,7 +170,7 @@ def step(
         target=frames.targets[0],
         **_sent(result),
     )
-    return seen._replace(models=models, control=result.carry, command=command), command
+    return seen._replace(models=models, decoding=following, control=result.carry, command=command), command
 
 
 def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Command]:

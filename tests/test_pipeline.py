@@ -240,6 +240,7 @@ def test_streaming_equals_batch(
         }  # fmt: skip
         for name, array in expected.items():
             np.testing.assert_allclose(getattr(command, name), array[n], atol=1e-9, rtol=0, err_msg=f"{name} at {n}")
+        assert command.fired == rollout.fired[n]
         assert command.contact == rollout.contact[n] and command.active_state == inference.active_state[n]
 
 

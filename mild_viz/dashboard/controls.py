@@ -68,11 +68,11 @@ class Controls:
 
     def read(self) -> Choice:
         """What the widgets say, checked. Raises UserError naming the widget."""
-        infer, checkpoint, trial = self._trial.read()
+        infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, contact_states)
         view = replace(self._view.read(), compared=self._compare.read())
-        return Choice(Settings(infer, control), view, checkpoint, trial)
+        return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 
     def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:
         """Follow a new rollout, and the figures of the controllers that are compared on its trial."""
@@ -136,7 +136,7 @@ def header_html(rollout: Rollout, model: str) -> str:
     """What is shown, and how well the model itself (not the controller) predicts this trial."""
     inference = rollout.inference
     errors = inference.window_error[np.isfinite(inference.window_error)]
-    mse = f"{errors.mean():.4f} rad²" if len(errors) else "unknown (no true motion)"
+    mse = f"{errors.mean():.4f} {inference.error_unit}" if len(errors) else "unknown (no true motion)"
     return (
         f'<div class="mv-header"><b>{escape(inference.dataset)} · {escape(inference.action)} · '
         f"{escape(inference.split)} {inference.trial}</b><br>"

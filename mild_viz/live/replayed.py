@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from mild_viz.data.skeletons import ARM_JOINTS, to_frame
+from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import unobserved_forward
 from mild_viz.live.config import LiveConfig
@@ -22,7 +23,7 @@ from mild_viz.live.onset import INTERACTING, RETURNING
 from mild_viz.live.person import skeleton_bones
 from mild_viz.live.session import Session
 from mild_viz.pipeline import joint_log_alpha, state_visits
-from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import WINDOW, ControlSettings, Placement, Watch
 from mild_viz.streaming import StreamModel
@@ -33,7 +34,7 @@ DATASET = "session"
 
 
 def session_header(
-    checkpoint: Checkpoint, model: StreamModel, robot_source: str, config: LiveConfig, addresses: tuple[str, str]
+    checkpoint: Checkpoint, model: StreamModel, robot_source: str | None, config: LiveConfig, addresses: tuple[str, str]
 ) -> dict[str, Any]:
     """What the first line of a session says: all that is needed to run it again."""
     return {
@@ -79,7 +80,12 @@ def session_checkpoint(session: Session, path: Path | None = None) -> Checkpoint
 def session_robot(session: Session, checkpoint: Checkpoint) -> RobotModel:
     """The robot that a session drove."""
     told = session.header["robot"]
-    robot = load_robot(told["source"], tuple(told["joint_names"]), checkpoint.for_robot().end_effector)
+    robot = open_robot(checkpoint, told["source"])
+    if list(robot.chain.joint_names) != told["joint_names"]:
+        raise UserError(
+            f"{session.path} drove the joints {', '.join(told['joint_names'])}; robot '{robot.name}' now has "
+            f"{', '.join(robot.chain.joint_names)}"
+        )
     return robot
 
 
@@ -203,7 +209,7 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
     )
     model_rules = checkpoint.contact_rules_of(header["action"])
     durations, occupancy = state_visits(active, inference.n_states, inference.rate)
-    placement = settings.placement or checkpoint.placement
+    placement = settings.placement or checkpoint.placement_for(robot.chain)
     shoulder = T_world_human[:3, 3] - robot.chain.shoulder
     end_effector = robot.end_effector(commanded)
     return Rollout(

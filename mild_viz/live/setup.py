@@ -38,9 +38,7 @@ def live_model(
 def live_placement(checkpoint: Checkpoint, robot: RobotModel, settings: ControlSettings) -> Placement:
     """Where the person stands, since a tracker does not know the robot: as chosen, else as stored with the model, else
     such that the hands of an adult and of the robot meet with both arms stretched forward."""
-    if settings.placement is not None or checkpoint.placement is not None:
-        placement = settings.placement or checkpoint.placement
-        assert placement is not None
+    if (placement := settings.placement or checkpoint.placement_for(robot.chain)) is not None:
         return placement
     nominal = Trial("nominal", "test", 0, checkpoint.actions[0], 1.0, NOMINAL_ARM[None])
     return outstretched_placement(robot.chain, nominal)

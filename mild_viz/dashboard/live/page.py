@@ -18,9 +18,9 @@ from mild_viz.dashboard.live.start import READY, PageSetup
 from mild_viz.dashboard.server import open_server
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.widgets import set_content
+from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.live.feed import Figures, Snapshot, newest
-from mild_viz.robot.model import load_robot
 
 NICE = 5
 """How much the page steps back for the control process, in steps of priority."""
@@ -34,7 +34,7 @@ class LivePage:
 
     def __init__(self, setup: PageSetup) -> None:
         checkpoint = load_checkpoint(setup.checkpoint)
-        robot = load_robot(setup.robot, setup.joint_names, setup.end_effector)
+        robot = open_robot(checkpoint, setup.robot)
         self.server = open_server(setup.host, setup.port, "mild_viz live")
         self.server.gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
         self._config = setup.config

@@ -34,10 +34,8 @@ class PageSetup:
     checkpoint: Path
     variant: str
     action: str
-    robot: str
-    """As `load_robot` takes it."""
-    joint_names: tuple[str, ...]
-    end_effector: str
+    robot: str | None
+    """As `open_robot` takes it."""
     settings: ControlSettings
     T_world_human: Float[np.ndarray, "4 4"]
     config: LiveConfig

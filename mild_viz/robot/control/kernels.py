@@ -223,7 +223,8 @@ def _ramp(choices, numbers, seconds, clock, flags):
     giving = choices[COMPLIANT] == 1 and flags[GIVING] == 1
     goal = numbers[SOFT] if giving else numbers[FREE]
     low, high = clock[STIFFNESS] - numbers[FALL] * seconds, clock[STIFFNESS] + numbers[RISE] * seconds
-    clock[STIFFNESS] = min(max(goal, low), high)
+    level = min(max(goal, low), high)
+    clock[STIFFNESS] = goal if abs(level - goal) <= SLACK else level
     return (1 << rules.SOFT if giving else 0) | (1 << rules.RAMPING if clock[STIFFNESS] != goal else 0)
 
 

@@ -136,16 +136,18 @@ def _parse(row: Any, action: str, where: str) -> ContactRules:
     if type(row) is not dict:
         raise UserError(f"{where} is {reprlib.repr(row)}, expected an object {{...}}")
     default = DEFAULT_RULES[action]
+    fields = {}
     for name, value in row.items():
         meant = asdict(default).get(name)
         if meant is None:
             raise UserError(f"{where}: {reprlib.repr(name)} is unknown; valid: {', '.join(asdict(default))}")
-        kinds = (float, int) if type(meant) is float else (type(meant),)
-        if type(value) not in kinds:
+        number = type(meant) is float and type(value) in (float, int) and abs(value) < 1e300
+        if not number and type(value) is not type(meant):
             expected = {bool: "true or false", float: "a number", str: "a text"}[type(meant)]
             raise UserError(f"{where}.{name} is {reprlib.repr(value)}, expected {expected}")
+        fields[name] = float(value) if number else value
     try:
-        return replace(default, **row)
+        return replace(default, **fields)
     except UserError as error:
         raise UserError(f"{where}.{error}") from None
 
