@@ -109,7 +109,7 @@ def live(
         loop = LiveLoop(LiveController(model, thresholds), source, sink, make_guard(model))
         shown = None
         if page:
-            shown = open_page(loop, recorder, checkpoint.path, run.robot, host, port, source.name, sink.name)
+            shown = open_page(loop, recorder, checkpoint.path, run, host, port, source.name, sink.name)
             closing.append(shown)
         warm_up(model, thresholds)
         loop.witnesses = tuple(witness for witness in (recorder, shown) if witness is not None)
@@ -122,7 +122,7 @@ def live(
 
 
 def open_page(
-    loop: LiveLoop, recorder: Recorder | None, checkpoint: Path, robot: str | None, host: str, port: int, source: str,
+    loop: LiveLoop, recorder: Recorder | None, checkpoint: Path, run: LiveOptions, host: str, port: int, source: str,
     output: str,
 ) -> PageProcess:  # fmt: skip
     """Start the page's process and wait until it stands. Raises UserError where it does not, such as a taken port."""
@@ -135,7 +135,8 @@ def open_page(
         checkpoint=checkpoint,
         variant=model.variant,
         action=model.action,
-        robot=robot,
+        robot=run.robot,
+        robot_source=run.robot_source,
         settings=model.settings,
         T_world_human=model.T_world_human,
         config=config,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
+SourceName = Literal["own", "robot_descriptions"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
@@ -87,9 +88,12 @@ class ModelOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. A model of a second human
-            (nuisi-human, handover-human) moves any of them. Default: the robot that the model was trained for, or
-            that of its dataset. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, kobo, a folder with a robot.toml, or the path of a URDF file. A
+            model of a second human (nuisi-human, handover-human) moves any of them. Default: the robot that the model
+            was trained for, or that of its dataset. Example: --robot ~/pepper.urdf
+        robot_source: Where the robot's looks come from: own, or robot_descriptions, the Python package that downloads
+            the manufacturer's meshes (needs: pip install 'mild-viz[robots]'). Without network ours are shown.
+            Example: --robot-source robot_descriptions
     """
 
     checkpoint: OptionalPath = None
@@ -102,6 +106,7 @@ class ModelOptions:
     stiffness: bool = True
     placement: OptionalPosition = None
     robot: OptionalText = None
+    robot_source: SourceName = "own"
 
     def settings(self) -> ControlSettings:
         """The settings of the controller."""
@@ -123,7 +128,7 @@ class ModelOptions:
         from mild_viz.decoding import open_robot
 
         checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(dataset))
-        return checkpoint, open_robot(checkpoint, self.robot)
+        return checkpoint, open_robot(checkpoint, self.robot, self.robot_source)
 
 
 @documented

@@ -25,6 +25,7 @@ from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
+from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
 from mild_viz.settings import InferSettings, choose
 from mild_viz.trial import Dataset
@@ -150,6 +151,7 @@ def open_dashboard(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Dashboard:
@@ -164,8 +166,8 @@ def open_dashboard(
     recordings = load_dataset(dataset)
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
-    arm = open_robot(model, robot)
-    catalog = Catalog(arm, folder)
+    arm = open_robot(model, robot, robot_source)
+    catalog = Catalog(arm, folder, robot_source)
     shown = catalog.robot_name
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
@@ -182,12 +184,13 @@ def run(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
 ) -> None:
     """Start the page and serve it until Ctrl-C."""
-    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, host, port)
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port)
     console = Console()
     console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
     if not is_loopback(host):

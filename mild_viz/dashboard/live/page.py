@@ -34,7 +34,7 @@ class LivePage:
 
     def __init__(self, setup: PageSetup) -> None:
         checkpoint = load_checkpoint(setup.checkpoint)
-        robot = open_robot(checkpoint, setup.robot)
+        robot = open_robot(checkpoint, setup.robot, setup.robot_source)
         self.server = open_server(setup.host, setup.port, "mild_viz live")
         self.server.gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
         self._config = setup.config

@@ -35,7 +35,8 @@ class PageSetup:
     variant: str
     action: str
     robot: str | None
-    """As `open_robot` takes it."""
+    """As `open_robot` takes it, like the next."""
+    robot_source: str
     settings: ControlSettings
     T_world_human: Float[np.ndarray, "4 4"]
     config: LiveConfig
