@@ -13,6 +13,7 @@ import tyro
 
 from mild_viz.errors import UserError
 from mild_viz.evaluate_commands import evaluate, report
+from mild_viz.live_commands import live
 from mild_viz.run_options import (
     OptionalInt,
     OptionalPath,
@@ -205,6 +206,7 @@ COMMANDS = {
     "sweep": sweep,
     "evaluate": evaluate,
     "report": report,
+    "live": live,
     "rollout": rollout,
     "record": record,
     "import-published": import_published,

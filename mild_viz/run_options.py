@@ -1,4 +1,4 @@
-"""What the commands `rollout` and `record` run the pipeline on, and how the options of any command are documented."""
+"""What the commands `rollout`, `record` and `live` run, and how the options of any command are documented."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from mild_viz import paths
 from mild_viz.errors import UserError
 
 if TYPE_CHECKING:
+    from mild_viz.checkpoint import Checkpoint
     from mild_viz.robot.model import RobotModel
     from mild_viz.rollout import Rollout
+    from mild_viz.settings import ControlSettings
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
@@ -68,14 +70,11 @@ def check_output(path: Path, suffix: str) -> None:
 
 @documented
 @dataclass(frozen=True)
-class RunOptions:
-    """What to run the pipeline on: model, trial and controller.
+class ModelOptions:
+    """What to run: model, robot and controller.
 
     Attributes:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
-        split: Part of the dataset. Example: --split train
-        trial: Trial of the split, from 0. Example: --trial 3
         variant: Variant of MILD. Default: v3.1, or the first one of a model without it. Example: --variant v2.1
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
@@ -101,9 +100,6 @@ class RunOptions:
     """
 
     checkpoint: OptionalPath = None
-    dataset: str = "demo"
-    split: SplitName = "test"
-    trial: int = 0
     variant: OptionalVariant = None
     controller: ControllerName = "mild-ik"
     other_arm: OtherArmName = "rest"
@@ -116,17 +112,11 @@ class RunOptions:
     robot: OptionalText = None
     robot_source: SourceName = "own"
 
-    def run(self) -> tuple[Rollout, RobotModel]:
-        """Load model, trial and robot, and run the pipeline. Raises UserError."""
-        from mild_viz.checkpoint import load_checkpoint
-        from mild_viz.data.load import load_dataset
-        from mild_viz.decoding import open_robot
-        from mild_viz.pipeline import control, infer
+    def settings(self) -> ControlSettings:
+        """The settings of the controller."""
         from mild_viz.settings import ControlSettings, Placement
 
-        trial = load_dataset(self.dataset).trial(self.split, self.trial)
-        checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
-        settings = ControlSettings(
+        return ControlSettings(
             controller=self.controller,
             other_arm=self.other_arm,
             lambda_x=self.lambda_x,
@@ -136,11 +126,37 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = open_robot(checkpoint, self.robot, self.robot_source)
-        return control(
-            infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot),
-            checkpoint,
-            robot,
-            trial,
-            settings,
-        ), robot
+
+    def load(self, dataset: str) -> tuple[Checkpoint, RobotModel]:
+        """The model, by default the one that ships for a dataset, and its robot, or the chosen one."""
+        from mild_viz.checkpoint import load_checkpoint
+        from mild_viz.decoding import open_robot
+
+        checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(dataset))
+        return checkpoint, open_robot(checkpoint, self.robot, self.robot_source)
+
+
+@documented
+@dataclass(frozen=True)
+class RunOptions(ModelOptions):
+    """What to run the pipeline on: model, trial and controller.
+
+    Attributes:
+        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
+        split: Part of the dataset. Example: --split train
+        trial: Trial of the split, from 0. Example: --trial 3
+    """
+
+    dataset: str = "demo"
+    split: SplitName = "test"
+    trial: int = 0
+
+    def run(self) -> tuple[Rollout, RobotModel]:
+        """Load model, trial and robot, and run the pipeline. Raises UserError."""
+        from mild_viz.data.load import load_dataset
+        from mild_viz.pipeline import control, infer
+
+        trial = load_dataset(self.dataset).trial(self.split, self.trial)
+        checkpoint, robot = self.load(self.dataset)
+        inference = infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot)
+        return control(inference, checkpoint, robot, trial, self.settings()), robot

@@ -12,11 +12,12 @@ from rich.console import Console
 
 from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
+from mild_viz.dashboard.address import is_loopback, page_url
 from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
-from mild_viz.dashboard.server import check_port, is_loopback, open_server, page_url
+from mild_viz.dashboard.server import check_port, open_server
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
