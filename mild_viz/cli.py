@@ -23,6 +23,7 @@ from mild_viz.run_options import (
     documented,
     leave,
 )
+from mild_viz.simulate_command import simulate
 from mild_viz.train_commands import sweep, train, train_baseline
 
 
@@ -201,6 +202,7 @@ COMMANDS = {
     "report": report,
     "rollout": rollout,
     "record": record,
+    "simulate": simulate,
     "import-published": import_published,
 }
 

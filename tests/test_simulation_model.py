@@ -41,7 +41,7 @@ def test_the_hand_is_where_our_kinematics_say(pepper: RobotModel) -> None:
 
 
 def test_masses_and_centres_are_the_makers(pepper: RobotModel, shared: Callable[[str], Path]) -> None:
-    ours = {link.name: link.inertial for link in pepper.description.urdf.robot.links}
+    ours: dict[str, Any] = {link.name: link.inertial for link in pepper.description.urdf.robot.links}
     root = ET.parse(shared("robots/pepper_naoqi/pepper.urdf")).getroot()
     reference = {str(link.get("name")): link for link in root.findall("link")}
     for link in LINKS + tuple(name.replace("R", "L", 1).replace("r_", "l_") for name in LINKS):

@@ -49,7 +49,7 @@ def efforts(robot: RobotModel) -> Float[np.ndarray, " J"]:
 
 
 def build_model(robot: RobotModel, timestep: float, gravity_compensation: bool) -> Any:
-    """The `mujoco.MjModel` of `robot.chain` on its base: one hinge per controlled joint, every other joint fixed where it rests.
+    """The `mujoco.MjModel` of `robot.chain` on its base: a hinge per controlled joint, all others fixed at rest.
 
     Each hinge has the description's limits of position and torque, the rotor's inertia of `robot.toml`, and one
     actuator whose torque is gain * ctrl + bias[0] + bias[1] * angle + bias[2] * velocity, all 0 until they are set.
