@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Int
 
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, pair_windows
 from mild_viz.errors import UserError
-from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import upright
-from mild_viz.robot.model import load_robot
+from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.retarget import retarget_pepper
 from mild_viz.robot.retarget_arm import retarget_arm
 from mild_viz.robot.robots import ROBOTS
@@ -50,9 +49,7 @@ class Windows:
 def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "T J"]:
     """The robot's joints that a trial shows: recorded, or retargeted from the partner's arm to a known robot.
 
-    The robot's own rule says how (`ArmSpec.retarget`). Where the partner's
-    heading in the world is known, the robot stands upright with that heading. NaN where the partner was not tracked
-    for longer than a gap that is filled.
+    NaN where the partner was not tracked for longer than a gap that is filled.
 
     Raises:
         UserError: if the trial shows no motion for these joints.
@@ -65,16 +62,56 @@ def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "
             f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
             f"it has {', '.join(trial.robot_joint_names) or 'no recorded robot'}"
         )
-    arm = fill_gaps(trial.partner_arm, max_gap(trial.rate))
-    if ROBOTS[robot].main.retarget == "pepper-angles":
-        return retarget_pepper(arm)
-    world = trial.T_world_partner
-    return retarget_arm(_chain(robot), arm, trial.rate, None if world is None else upright(world) @ world[:3, :3])
+    return retargeted_truth(trial, _robot(robot))
 
 
 @cache
-def _chain(robot: str) -> ArmChain:
-    return load_robot(robot).chain
+def _robot(name: str) -> RobotModel:
+    return load_robot(name)
+
+
+def retargeted_truth(trial: Trial, robot: RobotModel) -> Float[np.ndarray, "T J"]:
+    """The second human's motion as a robot would make it [rad], NaN where there is none.
+
+    Where the partner's heading in the world is known, the robot stands upright with that heading.
+    """
+    if trial.partner_arm is None:
+        return np.full((trial.n_frames, robot.chain.n_joints), np.nan)
+    arm = fill_gaps(trial.partner_arm, max_gap(trial.rate))
+    world = trial.T_world_partner
+    return retarget(robot, arm, trial.rate, None if world is None else upright(world) @ world[:3, :3])
+
+
+def retarget(
+    robot: RobotModel,
+    arm: Float[np.ndarray, "T 3 3"],
+    rate: float,
+    rotation: Float[np.ndarray, "3 3"] | None = None,
+    *,
+    length: Float[np.ndarray, " T"] | None = None,
+    previous: Float[np.ndarray, " J"] | None = None,
+) -> Float[np.ndarray, "T J"]:
+    """Joints [rad] of a robot that moves as a person's right arm (shoulder, elbow, wrist [m]) at `rate` [Hz].
+
+    Pepper's arm takes over the angles of the person's, every other one the place of the hand, by
+    `robot.retarget_arm`, which says what the other arguments are.
+    """
+    if robot.spec.main.retarget == "pepper-angles":
+        return retarget_pepper(arm)
+    return retarget_arm(robot.chain, arm, rate, rotation, length=length, previous=previous)
+
+
+def window_errors(
+    predicted: Float[np.ndarray, "R Y"], truth: Float[np.ndarray, "R Y"], human_human: bool
+) -> Float[np.ndarray, " R"]:
+    """Mean squared error of every window: of a robot's joints [rad^2], or of a second human's points [m^2].
+
+    Between humans the squared error is summed over xyz, and averaged over positions and velocities and 5 frames.
+    """
+    squared = (predicted - truth) ** 2
+    if human_human:
+        return squared.reshape(len(squared), -1, 3).sum(2).mean(1)
+    return squared.mean(1)
 
 
 def check_rate(rate: float | None, model: str, trials: Sequence[Trial]) -> None:

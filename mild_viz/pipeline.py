@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
+from mild_viz.decoding import decoding_of, open_robot
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
-from mild_viz.pairs import check_rate, robot_truth
+from mild_viz.pairs import check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
@@ -31,13 +32,16 @@ NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
 
 
-def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
+def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel | None = None) -> Inference:
     """What the model says about a trial: Algorithm vae-HMM-test up to the decoded joints.
 
+    A model of a second human decodes that person's arm, which `robot` follows (default: `decoding.open_robot`).
+
     Raises:
-        UserError: if the checkpoint does not know the variant or the action, or the trial is too short.
+        UserError: if the checkpoint does not know the variant or the action, drives another robot, or the trial is
+            too short.
     """
-    interface = checkpoint.for_robot()
+    decoding = decoding_of(checkpoint, robot or open_robot(checkpoint), trial.rate)
     check_rate(checkpoint.rate, checkpoint.name, [trial])
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
@@ -47,13 +51,13 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
 
     model = checkpoint.members(variant)[0]
     hmm, size = model.hmms[trial.action], model.human_vae.latent_size
-    human, robot = slice(0, size), slice(size, 2 * size)
-    truth = robot_truth(trial, interface.joint_names)
-    truth_windows = windows(truth)[WINDOW:]
+    human, partner = slice(0, size), slice(size, 2 * size)
+    moved, truth = decoding.move(said.decoded, decoding.start()), decoding.truth(trial)
+    truth_windows = windows(truth.features)[WINDOW:]
     latent_truth, _ = model.robot_vae.encode(truth_windows)
 
     newest = slice(NEWEST, NEWEST + n_windows)
-    n_joints = len(interface.joint_names)
+    first = slice(WINDOW, WINDOW + n_windows)
     return Inference(
         dataset=trial.dataset,
         split=trial.split,
@@ -61,7 +65,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         action=trial.action,
         variant=variant,
         rate=trial.rate,
-        joint_names=interface.joint_names,
+        joint_names=decoding.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
         observed=observed_rows(said.human_mean),
         tracked=observed_rows(trial.human_arm[newest].reshape(n_windows, -1)),
@@ -75,17 +79,20 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
         robot_latent_mean=said.robot_mean,
         robot_latent_covariance=said.robot_covariance,
         robot_latent_truth=latent_truth,
-        joints_decoded=said.decoded[:, :n_joints],
-        joints_truth=truth[WINDOW : WINDOW + n_windows],
-        window_error=((said.decoded - truth_windows) ** 2).mean(1),
+        joints_decoded=moved.joints,
+        joints_truth=truth.joints[first],
+        window_error=window_errors(said.decoded, truth_windows, moved.partner is not None),
         human_state_means=hmm.emission_means[:, human],
         human_state_covariances=hmm.emission_covariances[:, human, human],
-        robot_state_means=hmm.emission_means[:, robot],
-        robot_state_covariances=hmm.emission_covariances[:, robot, robot],
+        robot_state_means=hmm.emission_means[:, partner],
+        robot_state_covariances=hmm.emission_covariances[:, partner, partner],
         human_arm=trial.human_arm[newest],
         human_hand=arm[newest, 2],
         human_skeleton=_rows_of(trial.human_skeleton, newest),
         phase=None if trial.phase is None else trial.phase[newest],
+        decodes=decoding.decodes,
+        partner_decoded=moved.partner,
+        partner_truth=None if moved.partner is None else truth.features[first, :9].reshape(-1, 3, 3),
     )
 
 
@@ -105,7 +112,7 @@ def control(
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
     transition = checkpoint.transition_state_of(inference.variant, inference.action)
-    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement)
+    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement_for(robot.chain))
     target = in_frame(placed.T_world_human, inference.human_hand)
     result = run_controller(
         robot.chain,

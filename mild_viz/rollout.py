@@ -21,6 +21,10 @@ SAVED = (
 """Names of the arrays in a rollout file; row n of all of them belongs to human window n."""
 
 
+ERROR_UNITS = {"joints": "rad²", "arm": "m²"}
+"""By what a model decodes of the partner: a robot's joints, or a second human's arm, which the robot then follows."""
+
+
 @dataclass(frozen=True, eq=False)
 class Inference:
     """What the model says about one trial: encode, filter, condition, decode.
@@ -61,7 +65,7 @@ class Inference:
     joints_truth: Float[np.ndarray, "N J"]
     """NaN where the truth is unknown."""
     window_error: Float[np.ndarray, " N"]
-    """Mean squared error of the predicted window [rad^2]."""
+    """Mean squared error of the predicted window [`error_unit`]; NaN where the truth is unknown."""
     human_state_means: Float[np.ndarray, "S D"]
     human_state_covariances: Float[np.ndarray, "S D D"]
     robot_state_means: Float[np.ndarray, "S D"]
@@ -73,9 +77,20 @@ class Inference:
     human_skeleton: Skeleton | None = None
     """The whole body at the newest observations, human frame, where it was recorded."""
     phase: Int[np.ndarray, " N"] | None = None
+    decodes: str = "joints"
+    """What the model decodes of the partner: a key of `ERROR_UNITS`."""
+    partner_decoded: Float[np.ndarray, "N 3 3"] | None = None
+    """The second human's arm that was decoded, in that person's own frame [m]; None where joints were."""
+    partner_truth: Float[np.ndarray, "N 3 3"] | None = None
+    """The same as recorded; NaN where the truth is unknown."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    @property
+    def error_unit(self) -> str:
+        """The unit of `window_error`."""
+        return ERROR_UNITS[self.decodes]
 
     @property
     def n_windows(self) -> int:

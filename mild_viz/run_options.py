@@ -74,7 +74,7 @@ class RunOptions:
         dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
-        variant: Variant of MILD. Example: --variant v2.1
+        variant: Variant of MILD. Default: v3.1, or the first one of a model without it. Example: --variant v2.1
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
             model). Example: --controller mild
@@ -88,15 +88,16 @@ class RunOptions:
         placement: Where the human stands, seen from the robot: distance, lateral, height [m]. Default: the
             recording's where it has one world frame, else the model's estimate. Example: --placement 0.9 0.0
             0.8
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. Default: the robot that the model
-            was trained for. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file. A model of a second human
+            (nuisi-human, handover-human) moves any of them. Default: the robot that the model was trained for, or
+            that of its dataset. Example: --robot ~/pepper.urdf
     """
 
     checkpoint: OptionalPath = None
     dataset: str = "demo"
     split: SplitName = "test"
     trial: int = 0
-    variant: VariantName = "v3.1"
+    variant: OptionalVariant = None
     controller: ControllerName = "mild-ik"
     contact_states: OptionalStates = None
     lambda_x: float = 1.0
@@ -110,13 +111,12 @@ class RunOptions:
         """Load model, trial and robot, and run the pipeline. Raises UserError."""
         from mild_viz.checkpoint import load_checkpoint
         from mild_viz.data.load import load_dataset
+        from mild_viz.decoding import open_robot
         from mild_viz.pipeline import control, infer
-        from mild_viz.robot.model import load_robot
         from mild_viz.settings import ControlSettings, Placement
 
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
         checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
-        interface = checkpoint.for_robot()
         settings = ControlSettings(
             controller=self.controller,
             lambda_x=self.lambda_x,
@@ -126,5 +126,11 @@ class RunOptions:
             smoothing=self.smoothing,
             placement=None if self.placement is None else Placement(*self.placement),
         )
-        robot = load_robot(self.robot or interface.name, interface.joint_names, interface.end_effector)
-        return control(infer(checkpoint, trial, self.variant), checkpoint, robot, trial, settings), robot
+        robot = open_robot(checkpoint, self.robot)
+        return control(
+            infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot),
+            checkpoint,
+            robot,
+            trial,
+            settings,
+        ), robot

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
+from mild_viz.decoding import Decoding, decoding_of
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
 from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.prediction import advance
@@ -30,6 +31,7 @@ class StreamModel:
     variant: str
     action: str
     robot: RobotModel
+    decoding: Decoding
     settings: ControlSettings
     uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
@@ -52,6 +54,8 @@ class Carry(NamedTuple):
     previous: Float[np.ndarray, " 9"] | None
     """The previous frame's filled position."""
     models: tuple[ModelCarry, ...]
+    decoding: Float[np.ndarray, " J"]
+    """The last decoded joints."""
     control: ControlCarry
 
 
@@ -87,6 +91,7 @@ def stream_model(
         variant=variant,
         action=action,
         robot=robot,
+        decoding=decoding_of(checkpoint, robot, rate),
         settings=settings,
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
@@ -99,7 +104,7 @@ def start(model: StreamModel) -> Carry:
     """The state before the first observation."""
     empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, initial_carry(model.robot.chain))
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain))
 
 
 def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tuple[Carry, Command | None]:
@@ -114,7 +119,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
-    decoded = said.decoded[:, : len(model.robot.chain.joint_names)]
+    decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
     target = in_frame(model.T_world_human, hand[None])
     log_transition = said.log_transition if model.uses_transition else None
@@ -133,7 +138,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
         contact=bool(result.contact[0]),
         stiffness=result.stiffness[0],
     )
-    return seen._replace(models=models, control=result.carry), command
+    return seen._replace(models=models, decoding=following, control=result.carry), command
 
 
 def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
@@ -147,4 +152,6 @@ def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) ->
     position = filled.reshape(9)
     velocity = np.zeros(9) if carry.previous is None else position - carry.previous
     features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return Carry(features, carry.n_frames + 1, last_seen, gap, position, carry.models, carry.control)
+    return carry._replace(
+        features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=position
+    )

@@ -21,22 +21,26 @@ from mild_viz.checkpoint import (
     save_contact_states,
 )
 from mild_viz.errors import UserError
+from mild_viz.robot.placement import Meeting
 from mild_viz.settings import VARIANTS, Placement
 from tests.disk import full_disk
 from tests.models import random_checkpoint
+
+MEETING = Meeting((0.8, -0.1, -0.2), (0.5, 0.1, 0.2), "test")
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     path = tmp_path / "model"
-    save_checkpoint(replace(random_checkpoint(), placement=Placement(0.9, 0.1, 0.2, "test", True)), path, "# model\n")
+    places = {"placement": Placement(0.9, 0.1, 0.2, "test", True), "meeting": MEETING}
+    save_checkpoint(replace(random_checkpoint(), **places), path, "# model\n")
     return path
 
 
 def test_what_is_saved_is_loaded(folder: Path) -> None:
     original, loaded = random_checkpoint(), load_checkpoint(folder)
     assert loaded.variants == original.variants and loaded.actions == original.actions
-    assert loaded.placement == Placement(0.9, 0.1, 0.2, "test", True)
+    assert loaded.placement == Placement(0.9, 0.1, 0.2, "test", True) and loaded.meeting == MEETING
     assert loaded.contact_states == original.contact_states
     x = np.random.default_rng(0).normal(size=(3, 90))
     np.testing.assert_array_equal(loaded.human_vae.encode(x)[0], original.human_vae.encode(x)[0])
@@ -230,6 +234,15 @@ def test_values_that_are_not_finite_are_named(folder: Path) -> None:
             "placement: yaw unknown; valid: distance",
         ),
         ({"placement": 5}, "placement is 5, expected an object"),
+        ({"meeting": {"partner": [1, 0, 0]}}, "meeting: missing human, source"),
+        (
+            {"meeting": {"partner": [1, 0], "human": [1, 0, 0], "source": ""}},
+            r"meeting\.partner is .*, expected three numbers",
+        ),
+        (
+            {"meeting": {"partner": [0, 0, 0], "human": [1, 0, 0], "source": ""}},
+            "meeting: partner is .*0.0.*; valid: .* apart from the shoulder",
+        ),
         ({"training": None}, "training is None, expected an object"),
         ({"robot": {"name": "yumi", "joint_names": list("abcdefg"), "end_effector": "x"}}, "shape"),
     ],

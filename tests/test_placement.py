@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from mild_viz.robot.placement import (
     FACING,
     T_world_human,
     dyad_translation,
+    estimate_meeting,
     estimate_placement,
     outstretched_placement,
     place_human,
@@ -259,3 +262,17 @@ def test_same_place_for_descriptions_with_another_base(shared):
     place = Placement(0.8, 0.1, 0.0)
     difference = T_world_human(standing, place) - T_world_human(CHAIN, place)
     np.testing.assert_allclose(difference[:3, 3], [0.0, 0.0, 0.82], atol=1e-6)
+
+
+def test_a_meeting_puts_the_human_where_the_estimate_for_that_robot_does(dataset: Callable[[str], Any]) -> None:
+    train = dataset("nuisi").train
+    touching = [trial for trial in train if contact_frames(trial).any()]
+    meeting = estimate_meeting(touching)
+    assert 0.8 < np.linalg.norm(meeting.partner) < 1.0, "people meet with arms that are nearly stretched"
+    for name in ("pepper", "panda", "yumi"):
+        chain = load_robot(name).chain
+        fitted, placed = estimate_placement(chain, touching)[0], meeting.placement(chain)
+        for axis in ("distance", "lateral", "height"):
+            assert getattr(placed, axis) == pytest.approx(getattr(fitted, axis), abs=0.05)
+    with pytest.raises(UserError, match="no trial shows contact"):
+        estimate_meeting([trial for trial in train if trial.action == "wave"])

@@ -321,7 +321,7 @@ def test_package_paths(small_arm):
 
 
 def test_unknown_robot_and_missing_file(tmp_path):
-    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, panda, yumi, a folder"):
+    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, kobo, panda, yumi, a folder"):
         load_robot("peper")
     with pytest.raises(UserError, match="nothing.urdf is not a file"):
         load_robot(str(tmp_path / "nothing.urdf"))

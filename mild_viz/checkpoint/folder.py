@@ -19,9 +19,9 @@ from mild_viz.checkpoint.config import (
     is_config,
     parse_contact_states,
     read_config,
-    read_json,
     states_as_json,
 )
+from mild_viz.checkpoint.fields import read_json
 from mild_viz.checkpoint.model import Checkpoint
 from mild_viz.checkpoint.tensors import read_parts, tensors_of
 from mild_viz.errors import UserError
@@ -143,6 +143,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         own_contact_states=config.own_contact_states,
         transition_states=parts.transition_states,
         placement=config.placement,
+        meeting=config.meeting,
         hidden=config.hidden,
         training=config.training,
         metrics=config.metrics,

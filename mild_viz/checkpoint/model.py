@@ -14,6 +14,8 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.state_models import state_model_of
 from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
+from mild_viz.robot.chain import ArmChain
+from mild_viz.robot.placement import Meeting
 from mild_viz.settings import VARIANTS, Placement, choose
 
 
@@ -53,6 +55,9 @@ class Checkpoint:
     transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
     """Where reaching turns into contact, by action, in the latents that the variants share."""
     placement: Placement | None = None
+    """Where the human stands before the robot that it was trained for."""
+    meeting: Meeting | None = None
+    """Where the hands of two humans meet, for a model that is not of one robot."""
     hidden: tuple[int, int] = (40, 20)
     training: Mapping[str, Any] = field(default_factory=dict)
     """The command, seed and settings that made it."""
@@ -63,6 +68,11 @@ class Checkpoint:
         """The variants that it holds; a human-human model is v1 by construction (shared weights, no robot stage)."""
         shared = tuple(self.robot_vaes) if self.robot is not None else ("v1",)
         return shared + tuple(self.own_models)
+
+    @property
+    def default_variant(self) -> str:
+        """What is run where none is chosen: v3.1, else the first."""
+        return "v3.1" if "v3.1" in self.variants else self.variants[0]
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -106,10 +116,14 @@ class Checkpoint:
         """The transition state that a controller may use; None where there is none."""
         return self.members(variant)[0].transition_states.get(action)
 
+    def placement_for(self, chain: ArmChain) -> Placement | None:
+        """Where the human stands before a robot, as far as the model knows it."""
+        return self.placement or (self.meeting and self.meeting.placement(chain))
+
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""
         if self.robot is None:
             raise UserError(
-                f"checkpoint {self.name} is a human-human model and drives no robot; train --stage hri first"
+                f"checkpoint {self.name} is a human-human model and was trained for no robot; train --stage hri first"
             )
         return self.robot

@@ -20,9 +20,11 @@ from mild_viz.dashboard.server import check_port, is_loopback, open_server, page
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
+from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
-from mild_viz.robot.model import RobotModel, load_robot
-from mild_viz.rollout import Rollout
+from mild_viz.evaluation.controllers import controller_figures, run_controllers
+from mild_viz.robot.model import RobotModel
+from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import ControlSettings, InferSettings, choose
 from mild_viz.trial import Dataset, Trial
 
@@ -47,7 +49,7 @@ class Dashboard:
             self._write_html, self._write_csv,
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
-        stages = Pipeline(pipeline.infer, self._control)
+        stages = Pipeline(self._infer, self._control)
         self.session = Session(self.controls.read, stages, self._show, self.controls.report)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
         self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
@@ -60,22 +62,33 @@ class Dashboard:
         self.session.close()
         self.server.stop()
 
+    def _infer(self, checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
+        return pipeline.infer(checkpoint, trial, variant, self.robot)
+
     def _control(self, inference, checkpoint: Checkpoint, trial: Trial, settings: ControlSettings) -> Rollout:
         return pipeline.control(inference, checkpoint, self.robot, trial, settings)
 
     def _show(self, rollout: Rollout, choice: Choice, is_new: bool) -> None:
         """Called by the session's worker with every new rollout or view."""
         self._set_theme(choice.view.dark)
-        self.scene.show(rollout, choice.view)
+        compared = self._compare(rollout, choice)
+        self.scene.show(rollout, choice.view, compared)
         before = self.session.choice
         restart = before is None or before.trial is not choice.trial
-        self.controls.show(rollout, choice)
+        control, chain = choice.settings.control, self.robot.chain
+        figures = [controller_figures(one, chain, control.lambda_x, control.lambda_q) for one in compared]
+        self.controls.show(rollout, choice, figures)
         self.timeline.show(rollout, choice.view.alpha_mode)
         # Last: the player then draws this frame and lets the texts follow, on its own thread.
         self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
         if before is None:
             # Reading all datasets may take seconds: the page stands already, and the list completes itself.
             threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()
+
+    def _compare(self, rollout: Rollout, choice: Choice) -> tuple[Rollout, ...]:
+        """The rollouts of the compared controllers; a few milliseconds each, in the session's worker."""
+        compared, settings = choice.view.compared, choice.settings.control
+        return run_controllers(rollout.inference, choice.checkpoint, self.robot, choice.trial, settings, compared)
 
     def _tick(self, frame: int, playing: bool) -> None:
         self.timeline.tick(frame, playing)
@@ -123,8 +136,9 @@ def first_settings(
         trials = [one for one in trials if one.split == "test" and one.index == trial]
         if not trials:
             raise UserError(f"{dataset.name}: test trial {trial} is a {asked}, not a {action}; leave one of both out")
-    fallback = "v3.1" if "v3.1" in checkpoint.variants else checkpoint.variants[0]
-    variant = choose(f"checkpoint {checkpoint.name}: variant", variant or fallback, checkpoint.variants)
+    variant = choose(
+        f"checkpoint {checkpoint.name}: variant", variant or checkpoint.default_variant, checkpoint.variants
+    )
     return InferSettings(dataset.name, trials[0].split, trials[0].index, variant)
 
 
@@ -154,8 +168,7 @@ def open_dashboard(
     recordings = load_dataset(dataset)
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
-    interface = model.for_robot()
-    arm = load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
+    arm = open_robot(model, robot)
     catalog = Catalog(arm, folder)
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)

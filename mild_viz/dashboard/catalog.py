@@ -8,6 +8,7 @@ from pathlib import Path
 from mild_viz import paths
 from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
+from mild_viz.decoding import decoding_of
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.robots import robot_title
@@ -80,25 +81,23 @@ class Catalog:
     def _find_problem(self, model: str, dataset: str) -> str | None:
         try:
             checkpoint, recordings = self.checkpoint(model), self.dataset(dataset)
-            interface = checkpoint.for_robot()
+            trials = recordings.train + recordings.test
+            decoding_of(checkpoint, self._robot, trials[0].rate)
         except UserError as error:
             return str(error)
-        joints = self._robot.chain.joint_names
-        if interface.joint_names != joints:
-            return (
-                f"model '{model}' drives the joints {', '.join(interface.joint_names)}; "
-                f"robot '{self._robot.name}' is controlled by {', '.join(joints)}"
-            )
         if not set(checkpoint.actions) & set(recordings.actions):
             return (
                 f"model '{model}' knows {', '.join(checkpoint.actions)}; "
                 f"dataset '{dataset}' holds {', '.join(recordings.actions)}"
             )
-        recorded = next((t for t in recordings.train + recordings.test if t.robot_joints is not None), None)
-        if recorded is not None and recorded.robot_joint_names != interface.joint_names:
+        if checkpoint.robot is None:
+            people = any(trial.partner_arm is not None for trial in trials)
+            return None if people else f"model '{model}' predicts a second human; dataset '{dataset}' shows none"
+        recorded = next((trial for trial in trials if trial.robot_joints is not None), None)
+        if recorded is not None and recorded.robot_joint_names != checkpoint.robot.joint_names:
             return (
                 f"dataset '{dataset}' recorded the joints {', '.join(recorded.robot_joint_names)}, "
-                f"model '{model}' drives {', '.join(interface.joint_names)}"
+                f"model '{model}' drives {', '.join(checkpoint.robot.joint_names)}"
             )
         return None
 

@@ -91,7 +91,7 @@ def contact_distance(
         touching = contact_frames(trial)
         if not touching.any():
             continue
-        inference = infer(checkpoint, trial, variant)
+        inference = infer(checkpoint, trial, variant, robot)
         frames = np.rint(inference.time * trial.rate).astype(int)
         for controller in COMPARED:
             rollout = control(inference, checkpoint, robot, trial, ControlSettings(controller=controller))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mild_viz import pairs
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
 from mild_viz.evaluation import buetepage
@@ -17,7 +18,6 @@ from mild_viz.evaluation.buetepage import Buetepage
 from mild_viz.evaluation.paper import paper_rows
 from mild_viz.pairs import Windows, stack_windows
 from mild_viz.prediction import predict
-from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
 
 
@@ -80,15 +80,8 @@ class Measured:
 def window_errors(
     predicted: Float[np.ndarray, "R Y"], truth: Float[np.ndarray, "R Y"], human_human: bool
 ) -> Float[np.ndarray, " R"]:
-    """Error of every window: rad^2 averaged over joints and frames; or, between humans, m^2 x 100.
-
-    Between humans the squared error is summed over xyz and averaged over 3 positions and 3 velocities of
-    5 frames, times 100: what the paper calls cm.
-    """
-    squared = (predicted - truth) ** 2
-    if human_human:
-        return 100.0 * squared.reshape(len(squared), WINDOW * 6, 3).sum(2).mean(1)
-    return squared.mean(1)
+    """Error of every window (`pairs.window_errors`): rad^2; or, between humans, m^2 x 100, what the paper calls cm."""
+    return (100.0 if human_human else 1.0) * pairs.window_errors(predicted, truth, human_human)
 
 
 Model = Checkpoint | Buetepage

@@ -179,6 +179,8 @@ class UdpInput(StreamInput):
         check_options(address, ())
         self._socket = bind(address, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        # A full buffer drops what is newest. The system grants less than this, but more than it gives unasked.
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
         self._kernel_stamps = False
         if _STAMP is not None:
             with contextlib.suppress(OSError):

@@ -81,9 +81,12 @@ class Bridge:
         transport = getattr(self._protocol, "transport", None)
         return 0 if transport is None else transport.get_write_buffer_size()
 
-    def topic(self, name: str, kind: str) -> Any:
-        """A topic to subscribe to or to publish on."""
-        return self._library.Topic(self._ros, name, kind, queue_size=1, queue_length=1)
+    def topic(self, name: str, kind: str, published: bool) -> Any:
+        """A topic to publish on, or to subscribe to. After the connection was lost it is named to the server again."""
+        # What is published is named again with the next message; roslibpy's own way takes a second longer.
+        return self._library.Topic(
+            self._ros, name, kind, queue_size=1, queue_length=1, reconnect_on_close=not published
+        )
 
     def close(self) -> None:
         """Disconnect, and try no more."""
@@ -110,7 +113,7 @@ class RosbridgeInput(FedInput):
         topic = topic_option(address, "topic", SKELETON_TOPIC)
         super().__init__(f"rosbridge://{address.host}:{address.port}{topic}")
         self._bridge = Bridge(address, self)
-        self._topic = self._bridge.topic(topic, self._type)
+        self._topic = self._bridge.topic(topic, self._type, published=False)
         self._topic.subscribe(lambda message: self._feed(message, self.name))
 
     def _decode(self, payload: Any, received: float, source: str) -> Observation:
@@ -165,9 +168,11 @@ class RosbridgeOutput(QueuedOutput):
         trajectory = topic_option(address, "trajectory", "")
         super().__init__(f"rosbridge://{address.host}:{address.port}", joint_names, queued=8)
         self._bridge = Bridge(address, self)
-        self._json = self._bridge.topic(topic, STRING)
-        self._states = self._bridge.topic(states, "sensor_msgs/JointState")
-        self._trajectory = self._bridge.topic(trajectory, "trajectory_msgs/JointTrajectory") if trajectory else None
+        self._json = self._bridge.topic(topic, STRING, published=True)
+        self._states = self._bridge.topic(states, "sensor_msgs/JointState", published=True)
+        self._trajectory = None
+        if trajectory:
+            self._trajectory = self._bridge.topic(trajectory, "trajectory_msgs/JointTrajectory", published=True)
         for each in (self._json, self._states, self._trajectory):
             if each is not None:
                 each.advertise()

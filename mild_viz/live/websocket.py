@@ -115,8 +115,9 @@ class WebsocketOutput(Output):
             raise UserError(f"output '{address.text}': a path means nothing here; expected: ws://127.0.0.1:9871")
         self._socket = bind(address, socket.SOCK_STREAM)
         super().__init__(f"ws://{host_and_port(self._socket.getsockname())}", joint_names)
-        # Small, so that a client who stops reading is noticed after a second or so, not after megabytes.
+        # Small, so that a client who stops reading is noticed after a few hundred kilobytes, not after megabytes.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_WAITING)
+        self._socket.listen()  # from now on clients may come, though the thread takes a moment to start
         self._origins = [None, *(origin for origin in [address.options.get("origin")] if origin)]
         self._clients: set[ServerConnection] = set()
         self._queue: collections.deque[JointCommand] = collections.deque(maxlen=_QUEUED)

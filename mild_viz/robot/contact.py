@@ -75,8 +75,13 @@ def suggest_contact_states(
 
 def arm_length(arm: Float[np.ndarray, "T 3 3"]) -> float:
     """Median length of a person's upper arm and forearm together [m]; NaN where it was never seen."""
-    lengths = np.linalg.norm(np.diff(arm, axis=1), axis=2).sum(axis=1)
+    lengths = arm_lengths(arm)
     return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else np.nan
+
+
+def arm_lengths(arm: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:
+    """Length of upper arm and forearm together in every frame [m]."""
+    return np.linalg.norm(np.diff(arm, axis=1), axis=2).sum(axis=1)
 
 
 def in_frame(T_a_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:

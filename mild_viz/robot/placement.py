@@ -20,8 +20,8 @@ from jaxtyping import Float
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import arm_length, contact_frames, in_frame, upright
-from mild_viz.robot.retarget_arm import scaled_wrist
-from mild_viz.settings import Placement
+from mild_viz.robot.retarget_arm import LARGEST_FRACTION, scaled_wrist
+from mild_viz.settings import MAX_PLACEMENT, Placement
 from mild_viz.trial import Trial
 
 FACING = np.diag([-1.0, -1.0, 1.0])
@@ -32,6 +32,8 @@ SCALE = 0.03
 
 DIRECTION = 0.5
 """Weight of an error across the arm against one along it, which costs reach."""
+
+NO_CONTACT = "no trial shows contact; expected training trials of handshake, rocket, parachute or handover"
 
 OUTSTRETCHED = 0.85
 """Fraction of reach at which people meet, where no recording shows it (NuiSI: 0.86 to 0.9)."""
@@ -58,6 +60,30 @@ class PlacedHuman:
     placement: Placement
 
 
+@dataclass(frozen=True)
+class Meeting:
+    """Where two people's hands meet in recordings: what puts a human before any robot that takes one's place."""
+
+    partner: tuple[float, float, float]
+    """The partner's wrist from the shoulder, in the partner's own frame, as a share of the arm's length."""
+    human: tuple[float, float, float]
+    """The human's wrist, in the human's own frame [m]."""
+    source: str
+
+    def __post_init__(self) -> None:
+        for name in ("partner", "human"):
+            if not (np.abs(getattr(self, name)) < MAX_PLACEMENT).all():
+                raise UserError(f"meeting: {name} is {getattr(self, name)}; valid: numbers below {MAX_PLACEMENT}")
+        if not np.linalg.norm(self.partner) > 0.0:
+            raise UserError(f"meeting: partner is {self.partner}; valid: a place apart from the shoulder")
+
+    def placement(self, chain: ArmChain) -> Placement:
+        """Where a human stands who faces a robot, such that hands meet at the same fraction of reach."""
+        fraction = float(np.linalg.norm(self.partner))
+        reach = chain.reach * min(1.0, LARGEST_FRACTION / fraction) * np.array(self.partner)
+        return _placement(chain, chain.shoulder + reach - FACING @ self.human, self.source, estimated=True)
+
+
 class Sample(NamedTuple):
     """Where each of F contact frames of one trial would have the sought translation."""
 
@@ -74,7 +100,7 @@ def fit_translation(samples: Sequence[Sample]) -> Fit:
     """
     samples = [sample for sample in samples if len(sample.points)]
     if not samples:
-        raise UserError("no trial shows contact; expected training trials of handshake, rocket, parachute or handover")
+        raise UserError(NO_CONTACT)
     own = [_robust_fit(sample, np.ones(len(sample.points))) for sample in samples]
     merged = Sample(*(np.concatenate(arrays) for arrays in zip(*samples, strict=True)))
     translation = _robust_fit(merged, np.concatenate([np.full(len(s.points), 1.0 / len(s.points)) for s in samples]))
@@ -109,6 +135,27 @@ def estimate_placement(chain: ArmChain, trials: Sequence[Trial]) -> tuple[Placem
         f"({100 * fit.between_trials:.1f} cm between trials, {100 * fit.within_trials:.1f} cm within)"
     )
     return _placement(chain, fit.translation, source, estimated=True), fit
+
+
+def estimate_meeting(trials: Sequence[Trial]) -> Meeting:
+    """Where hands meet: per trial the median over its contact frames, then the median over the trials.
+
+    `UserError` where no trial shows contact.
+    """
+    partners, humans, n_frames = [], [], 0
+    for trial in trials:
+        touching = contact_frames(trial)
+        if trial.partner_arm is not None and touching.any():
+            arm = trial.partner_arm[touching]
+            partners.append(np.median(arm[:, 2] - arm[:, 0], axis=0) / arm_length(trial.partner_arm))
+            humans.append(np.median(trial.human_arm[touching, 2], axis=0))
+            n_frames += len(arm)
+    if not partners:
+        raise UserError(NO_CONTACT)
+    names = ", ".join(sorted({trial.dataset for trial in trials}))
+    source = f"estimated from {n_frames} contact frames of {len(partners)} training trials of {names}"
+    x, y, z = np.median(partners, axis=0).tolist()
+    return Meeting((x, y, z), tuple(np.median(humans, axis=0).tolist()), source)
 
 
 def T_world_human(

@@ -30,35 +30,52 @@ person would otherwise be faster in proportion, and a tracking error is no motio
 
 
 def scaled_wrist(
-    chain: ArmChain, arm: Float[np.ndarray, "T 3 3"], rotation: Float[np.ndarray, "3 3"]
+    chain: ArmChain,
+    arm: Float[np.ndarray, "T 3 3"],
+    rotation: Float[np.ndarray, "3 3"],
+    length: Float[np.ndarray, " T"] | float | None = None,
 ) -> Float[np.ndarray, "T 3"]:
     """Where the robot's hand is [m, base frame] if it stands to the robot's shoulder as the wrist to the person's.
 
     Direction and fraction of reach are kept, the latter up to `LARGEST_FRACTION`. `rotation` turns the person's frame
-    into the robot's base frame. NaN where the arm was not tracked.
+    into the robot's base frame, `length` is that of the person's arm [m] (default: its median over the frames). NaN
+    where the arm was not tracked.
     """
-    reach = (arm[:, 2] - arm[:, 0]) @ rotation.T / arm_length(arm)
+    length = np.asarray(arm_length(arm) if length is None else length)[..., None]
+    # einsum sums every row alike, however many there are: one frame alone gives the same bits
+    reach = np.einsum("ij,nj->ni", rotation, arm[:, 2] - arm[:, 0]) / length
     fraction = np.linalg.norm(reach, axis=1, keepdims=True)
     along = reach / np.maximum(fraction, np.finfo(float).tiny)
     return chain.shoulder + chain.reach * np.minimum(fraction, LARGEST_FRACTION) * along
 
 
 def retarget_arm(
-    chain: ArmChain, arm: Float[np.ndarray, "T 3 3"], rate: float, rotation: Float[np.ndarray, "3 3"] | None = None
+    chain: ArmChain,
+    arm: Float[np.ndarray, "T 3 3"],
+    rate: float,
+    rotation: Float[np.ndarray, "3 3"] | None = None,
+    *,
+    length: Float[np.ndarray, " T"] | float | None = None,
+    previous: Float[np.ndarray, " J"] | None = None,
 ) -> Float[np.ndarray, "T J"]:
     """Joints [rad] of T frames of shoulder, elbow, wrist [m] at `rate` [Hz], within the limits and `MAX_RATE`.
 
     `rotation` turns the person's frame (x forward, y left, z up) into the robot's base frame; None: they are equal.
     Only the wrist counts, not the elbow. Frames in which the arm was not tracked (NaN) give NaN, and the motion
     begins anew after them. (Eq. ik-prior-simplified with the resting posture as prior.)
+
+    All frames at once or one by one gives the same bits, if `length`, that of the person's arm, is given [m] (default:
+    its median over the frames), and as `previous` the joints of the frame before (NaN, or None: there is none).
     """
-    targets = _before_the_base(chain, scaled_wrist(chain, arm, np.eye(3) if rotation is None else rotation))
+    targets = _before_the_base(chain, scaled_wrist(chain, arm, np.eye(3) if rotation is None else rotation, length))
     joints = solve_ik(chain, targets, np.tile(chain.rest, (len(arm), 1)), 1.0, PRIOR)
     joints[np.isnan(arm).any(axis=(1, 2)) | np.isnan(targets).any(axis=1)] = np.nan
     step = MAX_RATE / rate
-    for last, now in zip(joints[:-1], joints[1:], strict=True):  # each row in turn, seen by the next
-        if np.isfinite(last).all():
+    last = previous
+    for now in joints:
+        if last is not None and np.isfinite(last).all():
             now[:] = last + np.clip(now - last, -step, step)
+        last = now
     return joints
 
 

@@ -17,8 +17,8 @@ from mild_viz.pairs import stack_windows
 from mild_viz.pipeline import NEWEST, infer
 from mild_viz.robot.contact import contact_frames, suggest_contact_states
 from mild_viz.robot.model import load_robot
-from mild_viz.robot.placement import estimate_placement
-from mild_viz.settings import VARIANTS, Placement
+from mild_viz.robot.placement import estimate_meeting, estimate_placement
+from mild_viz.settings import VARIANTS
 from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Trial
 
@@ -92,8 +92,7 @@ def save_best(candidates: Sequence[Candidate], plan: Plan, made: Made, out: Path
         "test_seeds": [[row.as_dict() for row in rows] for rows in test],
     }
     chosen = replace(chosen, training=training, metrics=metrics)
-    if plan.robot is not None:
-        chosen = _with_contact(chosen, candidates[best].fitted, plan)
+    chosen = _with_contact(chosen, candidates[best].fitted, plan)
     return save_checkpoint(chosen, out, readme(chosen, plan.source.title, out))
 
 
@@ -118,20 +117,19 @@ def _with_contact(checkpoint: Checkpoint, fitted: InteractionModel, plan: Plan) 
         own_states[variant] = contact_states(checkpoint, variant, plan.fit)
         own = learn_transition_states(models[0], own_states[variant], stack_windows(plan.fit, plan.joints))
         own_models[variant] = (replace(models[0], transition_states=own), *models[1:])
-    return replace(
+    checkpoint = replace(
         checkpoint,
         contact_states=states,
         transition_states=learnt,
         own_models=own_models,
         own_contact_states=own_states,
-        placement=contact_placement(plan.source.train, checkpoint.for_robot().name),
     )
-
-
-def contact_placement(trials: Sequence[Trial], robot: str) -> Placement | None:
-    """Where the human stands by the contact in the training trials; None where they show none."""
-    touching = [trial for trial in trials if contact_frames(trial).any()]
-    return estimate_placement(load_robot(robot).chain, touching)[0] if touching else None
+    touching = [trial for trial in plan.source.train if contact_frames(trial).any()]
+    if not touching:
+        return checkpoint
+    if checkpoint.robot is None:
+        return replace(checkpoint, meeting=estimate_meeting(touching))
+    return replace(checkpoint, placement=estimate_placement(load_robot(checkpoint.robot.name).chain, touching)[0])
 
 
 def contact_states(checkpoint: Checkpoint, variant: str, trials: Sequence[Trial]) -> dict[str, frozenset[int]]:
@@ -153,6 +151,11 @@ def readme(checkpoint: Checkpoint, title: str, path: Path) -> str:
     training, metrics = checkpoint.training, checkpoint.metrics
     held, scores = training["held_out_trials"], metrics["held_out"]
     unit = "rad²" if checkpoint.robot is not None else "m² × 100, the paper's 'cm'"
+    fitted = f"{training['fitted_trials']} trials fitted"
+    if any(scores):
+        fitted += (
+            f"; of {len(scores)} seeds, seed {training['chosen']} was chosen on {len(held)} held-out training trials"
+        )
     lines = [
         f"# {checkpoint.name}",
         "",
@@ -160,11 +163,8 @@ def readme(checkpoint: Checkpoint, title: str, path: Path) -> str:
         "",
         f"    {training['command']}",
         "",
-        f"Dataset `{checkpoint.dataset}`, SHA-256 `{checkpoint.dataset_checksum}`. {training['fitted_trials']} trials "
-        "fitted.",
+        f"Dataset `{checkpoint.dataset}`, SHA-256 `{checkpoint.dataset_checksum}`. {fitted}.",
     ]
-    if any(scores):
-        lines += [f"Of {len(scores)}, seed {training['chosen']} was best on {len(held)} held-out training trial(s)."]
     if checkpoint.own_models and not training["options"]["joint_held_out"]:
         lines += ["v4 is fitted to the held-out trials, too, and not chosen among the seeds."]
     lines += [

@@ -1,0 +1,128 @@
+"""What a model decodes of the partner, and the joints that a robot makes of it.
+
+A model either decodes the joints of the robot that it was trained for, or the right arm of a second human: that moves
+any robot, by the rule that retargets recordings to it (`pairs.retarget`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.checkpoint import Checkpoint
+from mild_viz.data.windows import fill_gaps, human_features, max_gap
+from mild_viz.errors import UserError
+from mild_viz.pairs import retarget, retargeted_truth, robot_truth
+from mild_viz.robot.contact import arm_lengths
+from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.robots import robot_of
+from mild_viz.trial import Trial
+
+
+class Truth(NamedTuple):
+    """The partner's true motion; NaN where it is unknown."""
+
+    features: Float[np.ndarray, "T F"]
+    """What a model predicts of every frame: the columns of its windows."""
+    joints: Float[np.ndarray, "T J"]
+    """What the robot would make of it [rad]."""
+
+
+class Moved(NamedTuple):
+    """A robot's answer to N decoded windows."""
+
+    joints: Float[np.ndarray, "N J"]
+    """Those of the first predicted frame [rad]."""
+    partner: Float[np.ndarray, "N 3 3"] | None
+    """The second human's arm in that frame, in that person's own frame [m]; None where joints are decoded."""
+    carry: Float[np.ndarray, " J"]
+    """The last joints: what the next windows go on from."""
+
+
+@dataclass(frozen=True)
+class JointDecoding:
+    """The model decodes the joints of the robot that it was trained for."""
+
+    joint_names: tuple[str, ...]
+    decodes = "joints"
+
+    def start(self) -> Float[np.ndarray, " J"]:
+        """The carry before the first window."""
+        return np.full(len(self.joint_names), np.nan)
+
+    def move(self, decoded: Float[np.ndarray, "N Y"], carry: Float[np.ndarray, " J"]) -> Moved:
+        """The joints of the first predicted frame."""
+        joints = decoded[:, : len(self.joint_names)]
+        return Moved(joints, None, joints[-1] if len(joints) else carry)
+
+    def truth(self, trial: Trial) -> Truth:
+        """The trial's recorded or retargeted joints. `UserError` where it has none."""
+        joints = robot_truth(trial, self.joint_names)
+        return Truth(joints, joints)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmDecoding:
+    """The model decodes a second human's right arm, which `robot` follows."""
+
+    robot: RobotModel
+    rate: float
+    """Frames a second [Hz]."""
+    decodes = "arm"
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return self.robot.chain.joint_names
+
+    def start(self) -> Float[np.ndarray, " J"]:
+        """The carry before the first window: there are no joints yet."""
+        return np.full(self.robot.chain.n_joints, np.nan)
+
+    def move(self, decoded: Float[np.ndarray, "N Y"], carry: Float[np.ndarray, " J"]) -> Moved:
+        """The arm of the first predicted frame, retargeted. All windows at once or one by one gives the same bits.
+
+        The hand keeps its share of that arm's own length: no length of a person has to be known. The robot's base takes
+        the place of the person's own frame, as if that stood upright: how a partner leans, nobody predicts.
+        """
+        partner = decoded[:, :9].reshape(-1, 3, 3)
+        joints = retarget(self.robot, partner, self.rate, length=arm_lengths(partner), previous=carry)
+        return Moved(joints, partner, joints[-1] if len(joints) else carry)
+
+    def truth(self, trial: Trial) -> Truth:
+        """The recorded arm, and the joints that it is retargeted to."""
+        arm = np.full((trial.n_frames, 3, 3), np.nan) if trial.partner_arm is None else trial.partner_arm
+        return Truth(human_features(fill_gaps(arm, max_gap(trial.rate))), retargeted_truth(trial, self.robot))
+
+
+Decoding = JointDecoding | ArmDecoding
+
+
+def open_robot(checkpoint: Checkpoint, robot: str | None = None) -> RobotModel:
+    """The robot of a name or path, with the joints that the model drives. `UserError` where it lacks them.
+
+    Default: the robot that the model was trained for; for a model of a second human, that of its dataset.
+    """
+    interface = checkpoint.robot
+    if interface is None:
+        return load_robot(robot or robot_of(checkpoint.dataset))
+    return load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
+
+
+def decoding_of(checkpoint: Checkpoint, robot: RobotModel, rate: float) -> Decoding:
+    """How a robot takes over what a model decodes at `rate` [Hz].
+
+    Raises:
+        UserError: if the model drives other joints than the robot's.
+    """
+    if checkpoint.robot is None:
+        return ArmDecoding(robot, rate)
+    joints = robot.chain.joint_names
+    if checkpoint.robot.joint_names != joints:
+        raise UserError(
+            f"model '{checkpoint.name}' drives the joints {', '.join(checkpoint.robot.joint_names)}; "
+            f"robot '{robot.name}' is controlled by {', '.join(joints)}"
+        )
+    return JointDecoding(joints)
