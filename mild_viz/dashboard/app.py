@@ -13,6 +13,7 @@ from rich.console import Console
 from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.compliance import ComplianceStage
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
@@ -50,7 +51,8 @@ class Dashboard:
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
         stages = Pipeline(self._infer, self._control)
-        self.session = Session(self.controls.read, stages, self._show, self.controls.report)
+        self.compliance = ComplianceStage(lambda: self.robot, self.scene, self.controls.compliance, self.timeline)
+        self.session = Session(self.controls.read, stages, self._show, self.controls.report, self.compliance.run)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
         self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
         self.session.start()
