@@ -38,8 +38,8 @@ class Slow:
         self.done: list[Choice] = []
         self.shown: list[Rollout] = []
         pipeline = Pipeline(
-            lambda checkpoint, trial, variant: make_inference(trial=trial.index, variant=variant),
-            lambda inference, checkpoint, trial, settings: make_rollout(inference, settings.controller),
+            lambda checkpoint, trial, variant, robot: make_inference(trial=trial.index, variant=variant),
+            lambda inference, checkpoint, robot, trial, settings: make_rollout(inference, settings.controller),
         )
         self.session = Session(
             lambda: self.choice, pipeline, lambda rollout, *_: self.shown.append(rollout), lambda _: None, self.finish

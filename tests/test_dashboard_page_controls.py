@@ -223,7 +223,7 @@ def test_the_page_simulates_when_asked(paused: Page, dashboard: Dashboard) -> No
     page, stage = paused, dashboard.compliance
     n_control = dashboard.session.n_control
     assert page.locator(".mv-force").count() == 0
-    tab(page, "Robot")
+    tab(page, "Force")
     tick(page, "Simulate", True)
     page.get_by_text("Force, peak [N]").wait_for(timeout=20_000)
     page.locator(".mv-force polyline").first.wait_for(state="attached")
@@ -245,7 +245,7 @@ def test_the_page_simulates_when_asked(paused: Page, dashboard: Dashboard) -> No
     assert not row(page, "Shaking by").count()
 
 
-def test_a_robot_without_inertia_says_so_in_the_folder(
+def test_a_robot_without_inertia_says_so_in_its_tab(
     paused: Page, dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -253,7 +253,7 @@ def test_a_robot_without_inertia_says_so_in_the_folder(
 
     monkeypatch.setattr("mild_viz.dashboard.compliance.compare", refuse)
     page = paused
-    tab(page, "Robot")
+    tab(page, "Force")
     dashboard.compliance._found.clear()
     tick(page, "Simulate", True)
     page.get_by_text("Not simulated: nothing that joint 'x' moves has an <inertial>.").wait_for(timeout=20_000)

@@ -22,23 +22,22 @@ NOTE = (
 )
 
 
-class ComplianceFolder:
+class ComplianceTab:
     """Widgets of `ComplianceSettings`, and the table."""
 
     def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
-        with gui.add_folder("Compliance"):
-            self._on = gui.add_checkbox(
-                "Simulate", False, hint="Simulate how the arm gives way to the human's hand (MuJoCo)."
-            )
-            self._scenario = gui.add_dropdown(
-                "Shaking by", tuple(SHAKING), visible=False,
-                hint="The robot moves as commanded; or its command stands still while the hands hold each other.",
-            )  # fmt: skip
-            self._stiffness = gui.add_dropdown(
-                "Stiffness", tuple(STIFFNESS), visible=False,
-                hint="Which arm is drawn: lowered stiffness in contact, or full stiffness throughout.",
-            )  # fmt: skip
-            self._text = gui.add_html("", visible=False)
+        self._on = gui.add_checkbox(
+            "Simulate", False, hint="Simulate how the arm gives way to the human's hand (MuJoCo)."
+        )
+        self._scenario = gui.add_dropdown(
+            "Shaking by", tuple(SHAKING), visible=False,
+            hint="The robot moves as commanded; or its command stands still while the hands hold each other.",
+        )  # fmt: skip
+        self._stiffness = gui.add_dropdown(
+            "Stiffness", tuple(STIFFNESS), visible=False,
+            hint="Which arm is drawn: lowered stiffness in contact, or full stiffness throughout.",
+        )  # fmt: skip
+        self._text = gui.add_html("", visible=False)
         for handle in (self._on, self._scenario, self._stiffness):
             on_person(handle, changed)
 
