@@ -26,6 +26,8 @@ class ViewSettings:
     compared: tuple[str, ...] = ()
     """Controllers that are run too, and drawn as ghosts beside the commanded arm."""
     show_human: bool = True
+    show_giver: bool = True
+    """Draw the recorded giver of a handover, faint, in the robot's place."""
     show_robot: bool = True
     show_latent: bool = True
     dark: bool = False

@@ -55,6 +55,8 @@ class Layout:
     hand: Vector
     """Where the hands are at their nearest."""
     floor: float
+    walk: Float[np.ndarray, "W 3"]
+    """Where the crown of the human's head is on the way, of one who walks."""
     plot_centre: Vector
     plot_yaw: float
 
@@ -86,15 +88,17 @@ def make_layout(
     human_eye: Vector,
     hand: Vector,
     floor: float,
+    walk: Float[np.ndarray, "W 3"] | None = None,
 ) -> Layout:
     """The layout of a dyad: the plot stands beyond the human, a little turned towards the dyad's viewer."""
+    walk = human_top[None] if walk is None else walk
     away = human_top * [1.0, 1.0, 0.0]  # not where the human's frame is: one who walks leaves it behind
     distance = float(np.linalg.norm(away))
     forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
-    centre = forward * (max(distance, 0.75) + 1.40)
+    centre = forward * (max(distance, 0.75, float((walk @ forward).max())) + 1.40)
     centre[2] = floor + 0.98
     yaw = float(np.arctan2(forward[1], forward[0])) + PLOT_TURN
-    return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
+    return Layout(forward, robot_top, human_top, human_eye, hand, floor, walk, centre, yaw)
 
 
 def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 0.0) -> Camera:
@@ -106,12 +110,13 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
     plot = plot_points(layout) + [layout.plot_title + (0.12 + headroom) * up]
     if name == "latent":
         direction = layout.side - 0.30 * layout.forward + 0.20 * up  # across the box, with a gap before the dyad
-        return beside(layout.human_top, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
-    foot = layout.human_top * [1.0, 1.0, 0.0] + floor * up
+        nearest = layout.walk[int((layout.walk @ layout.forward).argmax())]
+        return beside(nearest, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
     dyad = [layout.robot_title + (0.14 + headroom) * up - 0.5 * layout.forward]
-    dyad += [layout.human_title + (0.14 + headroom) * up + 0.26 * layout.forward]
+    dyad += [top + (TITLE_GAP + 0.14 + headroom) * up + 0.26 * layout.forward for top in layout.walk]
     dyad += [floor * up + 0.36 * (b * layout.side - layout.forward) for b in (-1, 1)]
-    dyad += [foot + 0.24 * (b * layout.side + layout.forward) for b in (-1, 1)]
+    feet = layout.walk * [1.0, 1.0, 0.0] + floor * up
+    dyad += [foot + 0.24 * (b * layout.side + layout.forward) for foot in feet for b in (-1, 1)]
     oblique = -0.55 * layout.forward + 0.38 * up if name == "experimenter" else 0.20 * up
     return fitted(np.array(dyad + plot), layout.side + oblique, aspect, margin=0.02)
 
