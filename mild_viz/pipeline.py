@@ -1,4 +1,4 @@
-"""The whole chain on one page: encode -> filter -> condition -> decode, then gate -> IK -> smooth -> stiffness.
+"""The whole chain on one page: encode -> filter -> condition -> decode, then gate -> IK -> smooth -> stiffen -> limit.
 
 `infer` depends on model, variant and trial; `control` on everything that a person may turn while watching.
 Both are pure functions: a page, a command or a test calls them alike.
@@ -21,7 +21,7 @@ from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame, nearest_wrists
-from mild_viz.robot.controller import initial_carry, run_controller
+from mild_viz.robot.control.controller import Frames, make_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
@@ -117,16 +117,18 @@ def control(
     transition = checkpoint.transition_state_of(inference.variant, inference.action)
     placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement_for(robot.chain))
     target = in_frame(placed.T_world_human, inference.human_hand)
-    result = run_controller(
-        robot.chain,
-        settings,
-        inference.action,
-        inference.log_alpha_human,
-        inference.joints_decoded,
-        target,
-        initial_carry(robot.chain),
-        inference.log_transition if uses_transition(settings, transition) else None,
+    rules = checkpoint.contact_rules_of(inference.action)
+    controller = make_controller(robot, settings, rules, inference.n_states, inference.rate)
+    crossing = inference.log_transition if uses_transition(settings, transition) else None
+    frames = Frames(
+        log_alpha=inference.log_alpha_human,
+        log_transition=np.full(inference.n_windows, -np.inf) if crossing is None else crossing,
+        decoded=inference.joints_decoded,
+        targets=target,
+        tracked=inference.tracked,
+        seconds=np.full(inference.n_windows, 1.0 / inference.rate),
     )
+    result = controller.run(frames, controller.start())
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
@@ -140,6 +142,8 @@ def control(
         hand_distance=np.linalg.norm(end_effector - target, axis=1),
         contact=result.contact,
         stiffness=result.stiffness,
+        compliant=rules.compliant,
+        fired=result.fired,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
         link_poses=robot.link_poses(result.joints, inference.action),

@@ -16,7 +16,7 @@ SAVED = (
     "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state", "log_transition",
     "human_latent_mean", "human_latent_covariance", "robot_latent_mean", "robot_latent_covariance",
     "robot_latent_truth", "joints_decoded", "joints_commanded", "joints_truth", "end_effector", "target",
-    "contact", "stiffness",
+    "contact", "stiffness", "fired",
 )  # fmt: skip
 """Names of the arrays in a rollout file; row n of all of them belongs to human window n."""
 
@@ -129,6 +129,10 @@ class Rollout:
     contact: Bool[np.ndarray, " N"]
     stiffness: Float[np.ndarray, "N J"]
     """Fraction of full joint stiffness, 0 to 1."""
+    compliant: bool
+    """Whether the stiffness is lowered in contact, by the rules of the action (not by the settings)."""
+    fired: Int[np.ndarray, " N"]
+    """Which rules fired, as bit masks: bit i is `robot.control.rules.RULES[i]`."""
     T_world_human: Float[np.ndarray, "4 4"]
     link_names: tuple[str, ...]
     link_poses: Float[np.ndarray, "N L 7"]

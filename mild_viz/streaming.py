@@ -1,12 +1,14 @@
 """The same chain one observation at a time: step(model, carry, observation) -> (carry, command).
 
+Where an observation is overdue, idle(model, carry, seconds) says what to send instead.
+
 Fed with the frames of a trial it gives the numbers of `pipeline.infer` and `pipeline.control` row by row.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,11 +16,13 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.decoding import Decoding, decoding_of
+from mild_viz.errors import UserError
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
+from mild_viz.pairs import rates_differ
 from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
-from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
+from mild_viz.robot.control.controller import ControlCarry, Controller, ControlResult, Frames, make_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.settings import HUMAN_FEATURES, WINDOW, ControlSettings, choose
 
@@ -33,6 +37,7 @@ class StreamModel:
     robot: RobotModel
     decoding: Decoding
     settings: ControlSettings
+    controller: Controller
     uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
     rate: float
@@ -57,14 +62,21 @@ class Carry(NamedTuple):
     decoding: Float[np.ndarray, " J"]
     """The last decoded joints."""
     control: ControlCarry
+    command: Command | None
+    """The last command."""
 
 
 class Command(NamedTuple):
-    """The answer to one observation; `None` fields until the first window is full."""
+    """What to send to the robot, and what led to it.
+
+    From `idle`, what the model says is as it was at the last observation, and NaN (and state -1) before the first.
+    """
 
     log_alpha: Float[np.ndarray, " S"]
     log_transition: float
     active_state: int
+    human_latent_mean: Float[np.ndarray, " D"]
+    human_latent_std: Float[np.ndarray, " D"]
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
     joints_decoded: Float[np.ndarray, " J"]
@@ -72,6 +84,8 @@ class Command(NamedTuple):
     target: Float[np.ndarray, " 3"]
     contact: bool
     stiffness: Float[np.ndarray, " J"]
+    fired: int
+    """Which rules fired, as a bit mask: bit i is `robot.control.rules.RULES[i]`."""
 
 
 def stream_model(
@@ -83,8 +97,17 @@ def stream_model(
     T_world_human: Float[np.ndarray, "4 4"],
     rate: float,
 ) -> StreamModel:
-    """Everything that a stream of observations at `rate` [Hz] needs."""
+    """Everything that a stream of observations at `rate` [Hz] needs.
+
+    Raises:
+        UserError: if the checkpoint does not know the variant or the action, or was trained at another rate.
+    """
     choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
+    if rates_differ(checkpoint.rate, rate):
+        raise UserError(
+            f"checkpoint {checkpoint.name} was trained on {checkpoint.rate:g} Hz, the stream has {rate:g} Hz; valid: "
+            f"observations at {checkpoint.rate:g} Hz, or a model trained on such"
+        )
     settings = with_contact_states(settings, checkpoint, variant, action)
     return StreamModel(
         models=checkpoint.members(variant),
@@ -93,6 +116,7 @@ def stream_model(
         robot=robot,
         decoding=decoding_of(checkpoint, robot, rate),
         settings=settings,
+        controller=make_controller(robot, settings, checkpoint.contact_rules_of(action), checkpoint.n_states, rate),
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,
@@ -101,16 +125,20 @@ def stream_model(
 
 
 def start(model: StreamModel) -> Carry:
-    """The state before the first observation."""
+    """The state before the first observation: the robot rests."""
     empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain))
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), model.controller.start(), None)
 
 
-def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tuple[Carry, Command | None]:
+def step(
+    model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"], seconds: float | None = None
+) -> tuple[Carry, Command | None]:
     """Take one observation of the human's arm (shoulder, elbow, wrist [m]; NaN where lost).
 
-    Returns the new carry, and the command for the next frame: None until five observations were taken.
+    `seconds` is the time since the last command [s], which the limits of the robot are about: by default that between
+    two observations. Returns the new carry, and the command for the next frame: None until five observations were
+    taken.
     """
     seen = _observe(model, carry, arm)
     if seen.n_frames < WINDOW:
@@ -121,24 +149,63 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
     decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
-    target = in_frame(model.T_world_human, hand[None])
-    log_transition = said.log_transition if model.uses_transition else None
-    result = run_controller(
-        model.robot.chain, model.settings, model.action, said.log_alpha, decoded, target, seen.control, log_transition
+    frames = Frames(
+        log_alpha=said.log_alpha,
+        log_transition=said.log_transition if model.uses_transition else np.full(1, -np.inf),
+        decoded=decoded,
+        targets=in_frame(model.T_world_human, hand[None]),
+        tracked=np.array([not np.isnan(arm).any()]),
+        seconds=np.array([1.0 / model.rate if seconds is None else seconds], dtype=float),
     )
+    result = model.controller.run(frames, seen.control)
     command = Command(
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
+        human_latent_mean=said.human_mean[0],
+        human_latent_std=said.human_std[0],
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
         joints_decoded=decoded[0],
-        joints_commanded=result.joints[0],
-        target=target[0],
-        contact=bool(result.contact[0]),
-        stiffness=result.stiffness[0],
+        target=frames.targets[0],
+        **_sent(result),
     )
-    return seen._replace(models=models, decoding=following, control=result.carry), command
+    return seen._replace(models=models, decoding=following, control=result.carry, command=command), command
+
+
+def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Command]:
+    """What to send when no usable observation came, `seconds` after the last command.
+
+    The robot stops where it is, and returns to rest when the human is gone (`settings.Watch`), within the same limits.
+    Where a frame was due and nothing came, `step` with NaN keeps the model's clock; this is for everything else. An
+    observation after a pause longer than `data.windows` bridges is the first of a new window.
+    """
+    result = model.controller.idle(carry.control, seconds)
+    if carry.command is None:
+        size, n_states = model.models[0].human_vae.latent_size, model.controller.n_states
+        nothing = {
+            "log_alpha": np.full(n_states, np.nan), "log_transition": np.nan, "active_state": -1,
+            "human_latent_mean": np.full(size, np.nan), "human_latent_std": np.full(size, np.nan),
+            "robot_latent_mean": np.full(size, np.nan), "robot_latent_covariance": np.full((size, size), np.nan),
+            "joints_decoded": np.full(model.robot.chain.n_joints, np.nan), "target": np.full(3, np.nan),
+        }  # fmt: skip
+        command = Command(**nothing, **_sent(result))
+    else:
+        command = carry.command._replace(**_sent(result))
+    if result.carry.age * model.rate > model.max_gap:
+        empty = np.full_like(carry.features, np.nan)
+        carry = carry._replace(features=empty, previous=None, last_seen=None)
+    return carry._replace(control=result.carry, command=command), command
+
+
+def _sent(result: ControlResult) -> dict[str, Any]:
+    """The fields of a command that the controller makes."""
+    return {
+        "joints_commanded": result.joints[0],
+        "contact": bool(result.contact[0]),
+        "stiffness": result.stiffness[0],
+        "fired": int(result.fired[0]),
+    }
 
 
 def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:

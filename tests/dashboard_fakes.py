@@ -90,6 +90,8 @@ def make_rollout(inference: Inference, controller: str = "mild-ik", **fields: An
         "hand_distance": np.linspace(0.5, 0.0, n),
         "contact": inference.active_state == 1,
         "stiffness": np.ones((n, 4)),
+        "compliant": True,
+        "fired": np.zeros(n, dtype=np.int64),
         "T_world_human": np.eye(4),
         "link_names": ("torso",),
         "link_poses": np.zeros((n, 1, 7)),

@@ -113,6 +113,11 @@ def test_its_kinematics_and_retargeting_work_without_code(crane: Path) -> None:
         (('elbow = "bend"', 'retarget = "angles"'), "retarget 'angles' is unknown; valid: position, pepper-angles"),
         (('elbow = "bend"', 'mirror_of = "right"'), "mirror_of 'right' is unknown"),
         (('elbow = "bend"', "mirror_signs = [1.0]"), "mirror_signs without mirror_of"),
+        (("[rest]", "[arms.only.position]\nlift = true\n[rest]"), "arms.only.position.lift is True"),
+        (("[rest]", "[arms.only.position]\nlevel_wight = 1\n[rest]"), "did you mean 'level_weight'"),
+        (("[rest]", "[arms.only.position]\nlevel_weight = -1\n[rest]"), "a weight below 0"),
+        (("[rest]", "[arms.only.position]\njoint_weights = [1]\n[rest]"), "expected 5, or none"),
+        (("[rest]", "[arms.only.position]\nelbow_weight = 1\n[rest]"), "lean or rise, with it"),
         (("[arms.only]", "[arms.only"), "is not valid TOML"),
     ],
 )

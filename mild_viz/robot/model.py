@@ -141,7 +141,11 @@ def load_robot(
     _check_values(spec, description)
     arms = {arm.name: arm for arm in _interacting_first(spec, joint_names, end_effector)}
     chains = {
-        name: load_chain(description, arm.joints, arm.end_effector, dict(spec.rest), arm.tip_offset)
+        name: replace(
+            load_chain(description, arm.joints, arm.end_effector, dict(spec.rest), arm.tip_offset),
+            elbow=arm.elbow,
+            position=arm.position,
+        )
         for name, arm in arms.items()
     }
     tree = build_tree(description, _all_joints(chains), dict(spec.rest), drawn_links(description))

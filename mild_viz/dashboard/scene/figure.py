@@ -126,8 +126,18 @@ def skeleton_figure(skeleton: Skeleton, height: float) -> Figure:
     radii = np.array([0.012 if name in FACE else 0.027 for name in names])
     radii[arm] = ARM_RADII
     poses = torso_poses(skeleton)
-    head = positions[:, names.index("head")] if "head" in names else poses[:, 4:] + [0.0, 0.0, body.HEAD_SHARE * height]
-    return assemble(positions, bones, bone_radii, radii, poses, held(head), height, arm, soles(skeleton, height))
+    return assemble(
+        positions, bones, bone_radii, radii, poses, held(heads(skeleton, poses, height)), height, arm,
+        soles(skeleton, height),
+    )  # fmt: skip
+
+
+def heads(skeleton: Skeleton, poses: Float[np.ndarray, "N 7"], height: float) -> Float[np.ndarray, "N 3"]:
+    """The middle of the head: between the ears where they were tracked (what is called head then is the chin's)."""
+    names, positions = skeleton.joint_names, skeleton.positions
+    if {"left_ear", "right_ear"} <= set(names):
+        return 0.5 * (positions[:, names.index("left_ear")] + positions[:, names.index("right_ear")])
+    return positions[:, names.index("head")] if "head" in names else poses[:, 4:] + [0.0, 0.0, body.HEAD_SHARE * height]
 
 
 def torso_poses(skeleton: Skeleton) -> Float[np.ndarray, "N 7"]:
