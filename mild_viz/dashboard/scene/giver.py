@@ -29,7 +29,7 @@ class GiverView:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
-        self._label = add_label(server, f"{ROOT}/label", "pale: recorded giver", NOTE, "center-right")
+        self._label = add_label(server, f"{ROOT}/label", "grey: recorded giver", NOTE, "center-right")
         self._frame.visible = False
         self._figure: Figure | None = None
         self._legs: viser.MeshHandle | None = None
@@ -53,8 +53,8 @@ class GiverView:
         for part in (self._torso, self._head, self._legs):
             if part is not None:
                 part.color = colors.schematic
-        # Behind the hips, where neither the robot nor what is written about it is.
-        self._label.position = figure.shoulders - [0.22, 0.0, body.PELVIS_SHARE * figure.height]
+        # Behind the thighs, where neither the robot nor anything that is written about the hands is.
+        self._label.position = figure.shoulders - [0.22, 0.0, 0.45 * figure.height]
 
     def set_frame(self, n: int) -> None:
         """Show frame n."""

@@ -76,7 +76,9 @@ class HandedView:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._frame = server.scene.add_frame(ROOT, show_axes=False, visible=False)
-        self._bottle = server.scene.add_mesh_simple(f"{ROOT}/bottle", *bottle(), cast_shadow=False, receive_shadow=False)
+        self._bottle = server.scene.add_mesh_simple(
+            f"{ROOT}/bottle", *bottle(), cast_shadow=False, receive_shadow=False
+        )
         self._label = add_label(server, f"{ROOT}/label", "", NOTE, "bottom-center")
         self._label.position = (0.0, 0.0, 0.03)
         self._frames: HandedFrames | None = None
@@ -84,7 +86,7 @@ class HandedView:
     def show(self, frames: HandedFrames | None, time: Float[np.ndarray, " N"], colors: Palette) -> None:
         """Take over where the object is, and the times of the frames [s]; None hides it."""
         self._frames = frames
-        self._held = "" if frames is None else f"object, with the robot until {time[frames.transfer]:.1f} s"
+        self._held = "" if frames is None else f"object, held until {time[frames.transfer]:.1f} s"
         self._bottle.color = colors.object
         self._frame.visible = False
 

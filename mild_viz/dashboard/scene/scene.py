@@ -205,6 +205,7 @@ def scene_layout(rollout: Rollout, figure: Figure, bounds: Float[np.ndarray, "2 
     )  # fmt: skip
     feet = float(sole[2]) if figure.soles is None else float((T[:3, :3] @ figure.soles + T[:3, 3])[2])
     hand = np.nan_to_num(rollout.target[nearest])
-    robot_top = np.array([0.0, 0.0, bounds[1, 2]])
+    arm_top = float(np.median(rollout.link_poses[:, :, 6].max(axis=1)))  # an arm without a body stands above its base
+    robot_top = np.array([0.0, 0.0, max(bounds[1, 2], arm_top)])
     walk = in_frame(T, figure.crowns[:: max(1, len(figure.crowns) // 16)]) if figure.walks else crown[None]
     return make_layout(robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet), walk)
