@@ -19,6 +19,7 @@ from mild_viz.pairs import retarget, retargeted_truth, robot_truth
 from mild_viz.robot.contact import arm_lengths
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.robots import robot_of
+from mild_viz.robot.source import RobotSource
 from mild_viz.trial import Trial
 
 
@@ -100,15 +101,16 @@ class ArmDecoding:
 Decoding = JointDecoding | ArmDecoding
 
 
-def open_robot(checkpoint: Checkpoint, robot: str | None = None) -> RobotModel:
+def open_robot(checkpoint: Checkpoint, robot: str | None = None, source: RobotSource = "own") -> RobotModel:
     """The robot of a name or path, with the joints that the model drives. `UserError` where it lacks them.
 
     Default: the robot that the model was trained for; for a model of a second human, that of its dataset.
+    `source`: see `load_robot`.
     """
     interface = checkpoint.robot
     if interface is None:
-        return load_robot(robot or robot_of(checkpoint.dataset))
-    return load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
+        return load_robot(robot or robot_of(checkpoint.dataset), source=source)
+    return load_robot(robot or interface.name, interface.joint_names, interface.end_effector, source)
 
 
 def decoding_of(checkpoint: Checkpoint, robot: RobotModel, rate: float) -> Decoding:

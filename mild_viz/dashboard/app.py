@@ -12,11 +12,12 @@ from rich.console import Console
 
 from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
+from mild_viz.dashboard.address import is_loopback, page_url
 from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
-from mild_viz.dashboard.server import check_port, is_loopback, open_server, page_url
+from mild_viz.dashboard.server import check_port, open_server
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
@@ -24,6 +25,7 @@ from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
+from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
 from mild_viz.settings import InferSettings, choose
 from mild_viz.trial import Dataset
@@ -149,6 +151,7 @@ def open_dashboard(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Dashboard:
@@ -163,8 +166,8 @@ def open_dashboard(
     recordings = load_dataset(dataset)
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
-    arm = open_robot(model, robot)
-    catalog = Catalog(arm, folder)
+    arm = open_robot(model, robot, robot_source)
+    catalog = Catalog(arm, folder, robot_source)
     shown = catalog.robot_name
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
@@ -181,12 +184,13 @@ def run(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
 ) -> None:
     """Start the page and serve it until Ctrl-C."""
-    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, host, port)
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port)
     console = Console()
     console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
     if not is_loopback(host):

@@ -11,7 +11,8 @@ from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
 from mild_viz.decoding import decoding_of
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel, load_robot
-from mild_viz.robot.robots import ROBOTS, robot_of, robot_title
+from mild_viz.robot.robots import ROBOTS, robot_of
+from mild_viz.robot.source import RobotSource
 from mild_viz.settings import choose
 from mild_viz.trial import Dataset, Trial
 
@@ -19,15 +20,16 @@ from mild_viz.trial import Dataset, Trial
 class Catalog:
     """Datasets, models and robots by name. Each is read when it is first asked for, and then kept."""
 
-    def __init__(self, robot: RobotModel, chosen: Path | None = None) -> None:
+    def __init__(self, robot: RobotModel, chosen: Path | None = None, source: RobotSource = "own") -> None:
         known = ROBOTS.get(robot.name)
         # another description of a robot that is known by name has its file for a name
-        self.robot_name = robot.name if known is None or known.urdf == robot.urdf else str(robot.urdf)
+        self.robot_name = robot.name if known is None or known.urdf == robot.spec.urdf else str(robot.spec.urdf)
         """Name on the page of the robot that is shown first."""
         self._robots = {self.robot_name: robot}
         self._checkpoints: dict[Path, Checkpoint] = {}
         self._problems: dict[tuple[str, str, str], str | None] = {}
         self.chosen = None if chosen is None else chosen.resolve()
+        self._source: RobotSource = source
 
     @cached_property
     def model_paths(self) -> dict[str, Path]:
@@ -59,13 +61,14 @@ class Catalog:
     @cached_property
     def robot_titles(self) -> dict[str, str]:
         """The robots by their names here, and what they are called on the page."""
-        names = dict.fromkeys([self.robot_name, *ROBOTS])
-        return {name: robot_title(name) for name in names}
+        others = {name: spec.title for name, spec in ROBOTS.items() if name != self.robot_name}
+        title = self._robots[self.robot_name].title  # its own folder's, which ROBOTS may not know
+        return {self.robot_name: f"{title} ({self.robot_name})" if title in others.values() else title, **others}
 
     def robot(self, name: str) -> RobotModel:
         """The robot of that name."""
         if name not in self._robots:
-            self._robots[name] = load_robot(choose("robot", name, list(self.robot_titles)))
+            self._robots[name] = load_robot(choose("robot", name, list(self.robot_titles)), source=self._source)
         return self._robots[name]
 
     def dataset(self, name: str) -> Dataset:

@@ -83,6 +83,8 @@ class RobotSpec:
     """Per action, where joints beyond the arms stand instead [rad or m]; they must not move an end effector."""
     stiffness: StiffnessSpec = StiffnessSpec()
     safety: SafetySpec = SafetySpec()
+    robot_descriptions: str | None = None
+    """Module of the package of that name that has the manufacturer's description."""
     file: Path | None = None
     """The robot.toml; None for a bare description."""
 
@@ -100,7 +102,7 @@ class RobotSpec:
         return self.main.end_effector
 
 
-KEYS = ("title", "description", "rest", "hands", "arms", "stiffness", "safety")
+KEYS = ("title", "description", "rest", "hands", "arms", "stiffness", "safety", "robot_descriptions")
 ARM_KEYS: dict[str, Any] = {
     name: hint for name, hint in get_type_hints(ArmSpec).items() if name not in ("name", "position")
 }
@@ -141,6 +143,7 @@ def read_spec(folder: Path) -> RobotSpec:
         hands={action: _values(hand, f"{file}: hands.{action}") for action, hand in hands.items()},
         stiffness=_stiffness(table.get("stiffness", {}), f"{file}: stiffness"),
         safety=_safety(table.get("safety", {}), f"{file}: safety"),
+        robot_descriptions=_module(table, f"{file}: robot_descriptions"),
         file=file,
     )
 
@@ -198,6 +201,13 @@ def _check_mirror(arm: ArmSpec, arms: Mapping[str, ArmSpec], where: str) -> None
         raise UserError(
             f"{where}: mirror_signs is {list(arm.mirror_signs)}; expected 1 or -1 for each of {n_joints} joints"
         )
+
+
+def _module(table: Mapping[str, Any], where: str) -> str | None:
+    name = converted(table["robot_descriptions"], str, where) if "robot_descriptions" in table else None
+    if name is not None and not name.isidentifier():
+        raise UserError(f"{where} is {name!r}; expected the name of a module, such as panda_description")
+    return name
 
 
 def _stiffness(value: Any, where: str) -> StiffnessSpec:

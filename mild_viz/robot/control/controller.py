@@ -187,11 +187,17 @@ class Controller:
 
 
 def make_controller(
-    robot: RobotModel, settings: ControlSettings, rules: ContactRules, n_states: int, rate: float
+    robot: RobotModel,
+    settings: ControlSettings,
+    rules: ContactRules,
+    n_states: int,
+    rate: float,
+    arm: str | None = None,
 ) -> Controller:
-    """The controller of a robot's interacting arm, with the robot's own limits."""
-    limits = limits_of(robot.chain, robot.spec.safety)
-    return Controller(robot.chain, settings, rules, n_states, rate, limits, robot.spec.stiffness)
+    """The controller of one of a robot's arms, with the robot's own limits. Default: the arm that interacts."""
+    chain = robot.chain if arm is None else robot.arms[arm]
+    limits = limits_of(chain, robot.spec.safety)
+    return Controller(chain, settings, rules, n_states, rate, limits, robot.spec.stiffness)
 
 
 def state_mask(states: frozenset[int], n_states: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from mild_viz.robot.control import rules
-from mild_viz.robot.kernels import ik_scratch, limit_step, solve_ik_one, unreachable_one
+from mild_viz.robot.kernels import copy_into, ik_scratch, limit_step, solve_ik_one, unreachable_one
 from mild_viz.robot.kinematics.kernels import LOWER, UPPER
 from mild_viz.robot.objective.kernels import plain_terms
 
@@ -56,13 +56,6 @@ REACHED = 1e-3
 
 SLACK = 1e-9
 """What is within this of a limit [rad or rad/s] passes, and fires no rule: rounding."""
-
-
-@njit(cache=True, fastmath=False)
-def _copy(source, into):
-    """Slice assignment, which numba takes seconds to compile."""
-    for i in range(into.shape[0]):
-        into[i] = source[i]
 
 
 @njit(cache=True, fastmath=False)
@@ -184,7 +177,7 @@ def _watch(numbers, tracked, target, seconds, hand, clock):
             apart += (target[i] - hand[i]) ** 2
         if not math.sqrt(apart) <= numbers[MAX_SPEED] * max(clock[UNSEEN], numbers[PERIOD]):
             return 1 << rules.JUMPED, False
-    _copy(target, hand)
+    copy_into(target, hand)
     clock[AGE] = clock[UNSEEN] = 0.0
     return 0, True
 
@@ -281,7 +274,7 @@ def control_loop(
                 if unreachable_one(arm, target, wanted, REACHED, spare, scratch):
                     bits |= 1 << rules.OUT_OF_REACH
             else:
-                _copy(prior, wanted)
+                copy_into(prior, wanted)
             if not _finite(wanted):  # numbers so large that the solver could not work with them
                 mode, bits = HOLD, bits | (1 << rules.INVALID)
         if mode == FOLLOW:
@@ -293,7 +286,7 @@ def control_loop(
             flags[STARTED] = 1
 
         if dt < SHORTEST:
-            _copy(motion[JOINTS], commands[k])
+            copy_into(motion[JOINTS], commands[k])
         else:
             clock[PENDING] = 0.0
             bits |= _protect(mode, wanted, limits, motion, dt, commands[k])
