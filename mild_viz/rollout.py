@@ -178,7 +178,6 @@ class Rollout:
     """Pose of the recorded second human's own frame; None where each person was recorded apart."""
     object_track: ObjectTrack | None = None
     """What is handed over as it was recorded, world."""
-
     other_arms: tuple[OtherArm, ...] = ()
     """The arms that move beside the one that interacts; those that only rest are not among them."""
 

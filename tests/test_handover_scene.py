@@ -18,6 +18,7 @@ from mild_viz.dashboard.scene.ground import pedestal
 from mild_viz.dashboard.scene.handed import GRIP, HEIGHT, RADIUS, bottle, hand_link, handed_frames
 from mild_viz.dashboard.scene.layout import TITLE_GAP
 from mild_viz.dashboard.scene.scene import Scene
+from mild_viz.dashboard.tabs.view import ViewTab
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.data.load import load_dataset
 from mild_viz.data.skeletons import to_world
@@ -205,3 +206,15 @@ def test_a_narrow_robot_that_stands_high_gets_a_slim_stand() -> None:
         widest = np.hypot(*vertices[middle, :2].T).max(initial=0.0)
         assert (0.0 < widest < 0.25) == slim
         assert vertices[:, 2].min() == 0.0 and vertices[:, 2].max() == pytest.approx(top)
+
+
+def test_the_giver_can_be_hidden_where_one_was_recorded(server: viser.ViserServer, handover: Handover) -> None:
+    tab = ViewTab(server.gui, lambda: None, lambda *_: None)
+    rollout, _ = handover
+    tab.show(rollout)
+    assert tab._giver.visible and tab.read().show_giver
+    tab._giver.value = False
+    assert not tab.read().show_giver
+    robot = load_robot("pepper")
+    tab.show(scene_rollout(robot, scene_inference()))
+    assert not tab._giver.visible
