@@ -43,6 +43,8 @@ class ViewSettings:
     compliance: ComplianceSettings | None = None
     """None: nothing is simulated."""
     show_human: bool = True
+    show_giver: bool = True
+    """Draw the recorded giver of a handover, faint, in the robot's place."""
     show_robot: bool = True
     show_latent: bool = True
     dark: bool = False
