@@ -22,6 +22,7 @@ from mild_viz.pairs import check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.control.controller import Frames, make_controller
+from mild_viz.robot.control.other_arm import move_other_arms
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
@@ -126,6 +127,10 @@ def control(
         seconds=np.full(inference.n_windows, 1.0 / inference.rate),
     )
     result = controller.run(frames, controller.start())
+    others = move_other_arms(robot, controller, frames, inference.human_skeleton, placed.T_world_human)
+    commanded, decoded = (
+        {arm.name: getattr(arm, f"joints_{kind}") for arm in others} for kind in ("commanded", "decoded")
+    )
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
@@ -143,12 +148,13 @@ def control(
         fired=result.fired,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
-        link_poses=robot.link_poses(result.joints, inference.action),
-        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action),
+        link_poses=robot.link_poses(result.joints, inference.action, commanded),
+        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action, decoded),
         state_durations=durations,
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),
         placement=placed.placement,
+        other_arms=others,
     )
 
 

@@ -106,6 +106,34 @@ class Inference:
 
 
 @dataclass(frozen=True, eq=False)
+class OtherArm:
+    """What an arm does that moves beside the one that interacts; K joints."""
+
+    name: str
+    controller: str
+    joint_names: tuple[str, ...]
+    joints_decoded: Float[np.ndarray, "N K"]
+    """The decoded joints, mirrored; the resting joints where the controller takes none."""
+    joints_commanded: Float[np.ndarray, "N K"]
+    end_effector: Float[np.ndarray, "N 3"]
+    """World [m]."""
+    target: Float[np.ndarray, "N 3"]
+    """The human's left hand, world [m]; NaN where it is not known."""
+    hand_distance: Float[np.ndarray, " N"]
+    """|end_effector - target| [m]."""
+    stiffness: Float[np.ndarray, "N K"]
+    fired: Int[np.ndarray, " N"]
+    """As `Rollout.fired`, of this arm."""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+OTHER_SAVED = ("joints_commanded", "end_effector", "target", "stiffness", "fired")
+"""Names of the arrays of another arm in a rollout file, there with the arm's name before them."""
+
+
+@dataclass(frozen=True, eq=False)
 class Rollout:
     """An `Inference` and the commands that a controller makes of it. World is the robot's base frame."""
 
@@ -141,6 +169,9 @@ class Rollout:
     placement: Placement
     """Where the human stands, and in words for the page where that comes from."""
 
+    other_arms: tuple[OtherArm, ...] = ()
+    """The arms that move beside the one that interacts; those that only rest are not among them."""
+
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
@@ -149,8 +180,9 @@ class Rollout:
         return getattr(self if name in type(self).__dataclass_fields__ else self.inference, name)
 
     def save(self, path: Path) -> None:
-        """Write the arrays named in `SAVED` to an .npz file, atomically."""
+        """Write the arrays named in `SAVED`, and in `OTHER_SAVED` of every other arm, to an .npz file, atomically."""
         arrays = {name: self.array(name) for name in SAVED}
+        arrays |= {f"{arm.name}_{name}": getattr(arm, name) for arm in self.other_arms for name in OTHER_SAVED}
 
         def write(temporary: Path) -> None:
             with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name

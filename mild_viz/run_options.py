@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
 ControllerName = Literal["base-ik", "mild", "mild-ik"]
+OtherArmName = Literal["rest", "base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
 SourceName = Literal["own", "robot_descriptions"]
 
@@ -78,6 +79,8 @@ class ModelOptions:
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
             model). Example: --controller mild
+        other_arm: What the robot's other arm does: rest, mild (the decoded joints, mirrored), base-ik (it follows the
+            human's left hand, where that was recorded) or mild-ik (both). Example: --other-arm mild
         contact_states: States of the HMM in which the partners touch. Default: the model's own, as saved from
             the dashboard. Example: --contact-states 2 3
         lambda_x: Weight of reaching the hand [1/m^2], 0 or more. Example: --lambda-x 2
@@ -99,6 +102,7 @@ class ModelOptions:
     checkpoint: OptionalPath = None
     variant: OptionalVariant = None
     controller: ControllerName = "mild-ik"
+    other_arm: OtherArmName = "rest"
     contact_states: OptionalStates = None
     lambda_x: float = 1.0
     lambda_q: float = 0.01
@@ -114,6 +118,7 @@ class ModelOptions:
 
         return ControlSettings(
             controller=self.controller,
+            other_arm=self.other_arm,
             lambda_x=self.lambda_x,
             lambda_q=self.lambda_q,
             contact_states=None if self.contact_states is None else frozenset(self.contact_states),

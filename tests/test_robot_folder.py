@@ -108,7 +108,7 @@ def test_the_whole_pipeline_drives_it_without_code(crane: Path) -> None:
     commanded = rollout.joints_commanded
     assert (commanded >= robot.chain.lower).all() and (commanded <= robot.chain.upper).all()
     np.testing.assert_allclose(forward(robot.chain, commanded), rollout.end_effector, atol=1e-9)
-    assert np.nanmin(rollout.hand_distance) < 0.02  # by its tip, not by the link's origin
+    assert np.nanmin(rollout.hand_distance) < 0.03  # by its tip, 0.2 m from the origin of the link
     assert np.isfinite(rollout.link_poses).all()
     assert np.ptp(rollout.link_poses[:, robot.link_names.index("roll_link"), 4:], axis=0).max() > 0.05
 

@@ -83,7 +83,7 @@ def _bounded_step(arm, hessian, damping, gradient, q, step, fixed, factor, rhs):
 
 
 @njit(cache=True, fastmath=False)
-def _copy(source, into):
+def copy_into(source, into):
     """Slice assignment, which numba takes seconds to compile."""
     for i in range(into.shape[0]):
         into[i] = source[i]
@@ -148,8 +148,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, q, scratch):
                 damping, growth = max(damping * growth, 1e-3 * scale), 2.0 * growth
         if not improved or still:
             break
-        _copy(candidate, q)
-        _copy(moved, position)
+        copy_into(candidate, q)
+        copy_into(moved, position)
         cost = new_cost
     # The objective is flat to rounding here, the gradient is not: one more Newton step squares what is left, so that
     # inputs that differ by rounding give the same solution to rounding. Where the arm can turn freely about its

@@ -92,7 +92,8 @@ class Controller:
 
     Controllers: `mild` sends the decoded joints; `mild-ik` adapts them by IK in the contact states, with
     the decoded joints as prior (Algorithm vae-HMM-test); `base-ik` follows the hand at every frame by IK
-    without a prior, from the previous command on (Eq. ik-plain). A NaN target means no IK in that frame. IK
+    without the model, from the previous command on, which a weight of 1e-3 lambda_x keeps it near, so that it does not
+    leap at the border of reach (Eq. ik-plain). A NaN target means no IK in that frame. IK
     goes no farther in a frame than the joints' velocity limits admit.
 
     The wanted joints are smoothed by a weighted moving average; the safety filter makes the command of them.
@@ -187,11 +188,17 @@ class Controller:
 
 
 def make_controller(
-    robot: RobotModel, settings: ControlSettings, rules: ContactRules, n_states: int, rate: float
+    robot: RobotModel,
+    settings: ControlSettings,
+    rules: ContactRules,
+    n_states: int,
+    rate: float,
+    arm: str | None = None,
 ) -> Controller:
-    """The controller of a robot's interacting arm, with the robot's own limits."""
-    limits = limits_of(robot.chain, robot.spec.safety)
-    return Controller(robot.chain, settings, rules, n_states, rate, limits, robot.spec.stiffness)
+    """The controller of one of a robot's arms, with the robot's own limits. Default: the arm that interacts."""
+    chain = robot.chain if arm is None else robot.arms[arm]
+    limits = limits_of(chain, robot.spec.safety)
+    return Controller(chain, settings, rules, n_states, rate, limits, robot.spec.stiffness)
 
 
 def state_mask(states: frozenset[int], n_states: int) -> int:

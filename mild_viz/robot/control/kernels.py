@@ -11,12 +11,15 @@ import numpy as np
 from numba import njit
 
 from mild_viz.robot.control import rules
-from mild_viz.robot.kernels import ik_scratch, limit_step, solve_ik_one, unreachable_one
+from mild_viz.robot.kernels import copy_into, ik_scratch, limit_step, solve_ik_one, unreachable_one
 from mild_viz.robot.kinematics.kernels import LOWER, UPPER
 from mild_viz.robot.objective.kernels import plain_terms
 
 BASE_IK, MILD, MILD_IK = 0, 1, 2
 """Controllers, in the order of `settings.CONTROLLERS`."""
+
+FOLLOWING = 1e-3
+"""Pull of base-ik to its last command, as a share of lambda_x: without, an arm leaps at the border of its reach."""
 
 CONTROLLER, CONTACT_STATES, COMPLIANT, NO_RETURN, IK_CROSSED = 0, 1, 2, 3, 4
 """Slots of the choices, whole numbers; contact states are a bit mask."""
@@ -56,13 +59,6 @@ REACHED = 1e-3
 
 SLACK = 1e-9
 """What is within this of a limit [rad or rad/s] passes, and fires no rule: rounding."""
-
-
-@njit(cache=True, fastmath=False)
-def _copy(source, into):
-    """Slice assignment, which numba takes seconds to compile."""
-    for i in range(into.shape[0]):
-        into[i] = source[i]
 
 
 @njit(cache=True, fastmath=False)
@@ -184,7 +180,7 @@ def _watch(numbers, tracked, target, seconds, hand, clock):
             apart += (target[i] - hand[i]) ** 2
         if not math.sqrt(apart) <= numbers[MAX_SPEED] * max(clock[UNSEEN], numbers[PERIOD]):
             return 1 << rules.JUMPED, False
-    _copy(target, hand)
+    copy_into(target, hand)
     clock[AGE] = clock[UNSEEN] = 0.0
     return 0, True
 
@@ -269,7 +265,9 @@ def control_loop(
             crossed = choices[IK_CROSSED] == 1 and flags[PROGRESS] != REACHING
             doubt = choices[CONTACT_STATES] != 0 and math.exp(log_alpha[k, active]) < numbers[DOUBT]
             adapt = controller == BASE_IK or (controller == MILD_IK and (contact[k] or crossed or doubt))
-            prior, weight = (motion[JOINTS], 0.0) if controller == BASE_IK else (decoded[k], numbers[LAMBDA_Q])
+            prior, weight = decoded[k], numbers[LAMBDA_Q]
+            if controller == BASE_IK:
+                prior, weight = motion[JOINTS], FOLLOWING * numbers[LAMBDA_X]
             if adapt and _finite(target):
                 for i in range(size):
                     steps[i] = limits[VELOCITY, i] * dt
@@ -281,7 +279,7 @@ def control_loop(
                 if unreachable_one(arm, target, wanted, REACHED, spare, scratch):
                     bits |= 1 << rules.OUT_OF_REACH
             else:
-                _copy(prior, wanted)
+                copy_into(prior, wanted)
             if not _finite(wanted):  # numbers so large that the solver could not work with them
                 mode, bits = HOLD, bits | (1 << rules.INVALID)
         if mode == FOLLOW:
@@ -293,7 +291,7 @@ def control_loop(
             flags[STARTED] = 1
 
         if dt < SHORTEST:
-            _copy(motion[JOINTS], commands[k])
+            copy_into(motion[JOINTS], commands[k])
         else:
             clock[PENDING] = 0.0
             bits |= _protect(mode, wanted, limits, motion, dt, commands[k])
