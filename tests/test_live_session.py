@@ -42,6 +42,7 @@ from mild_viz.live.session import Session, plain, read_session, to_line
 from mild_viz.live.setup import live_model, make_guard
 from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer
+from mild_viz.settings import WINDOW
 from mild_viz.streaming import StreamModel
 
 HANDSHAKE, WAVE = 4, 0
@@ -147,7 +148,7 @@ def test_an_interaction_is_a_trial_for_the_pipeline(recorded: tuple[Session, lis
     taken = [tick for tick in interactions(session)[1] if tick_taken(tick)]
     said = [tick.decision.command for tick in taken if tick.decision is not None]
     assert len(said) > 80 and inference.n_windows >= len(said)
-    rows = slice(inference.n_windows - len(said), None)
+    rows = np.cumsum([len(tick.decision.samples) for tick in taken if tick.decision is not None]) - WINDOW
     np.testing.assert_allclose(inference.log_alpha_human[rows], [each.log_alpha for each in said], atol=1e-9)
     np.testing.assert_allclose(inference.joints_decoded[rows], [each.joints_decoded for each in said], atol=1e-9)
     np.testing.assert_allclose(inference.robot_latent_mean[rows], [each.robot_latent_mean for each in said], atol=1e-9)
