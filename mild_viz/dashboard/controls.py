@@ -25,7 +25,7 @@ from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import ControllerFigures
 from mild_viz.rollout import Rollout
-from mild_viz.settings import InferSettings, Settings
+from mild_viz.settings import ControlSettings, InferSettings, Settings
 from mild_viz.trial import CONTACT_ACTIONS
 
 
@@ -42,6 +42,7 @@ class Controls:
         move_camera: Callable[[viser.ClientHandle, str], None],
         write_html: Writer,
         write_csv: Writer,
+        control: ControlSettings,
     ) -> None:
         self._server, self._catalog = server, catalog
         self._rollout: Rollout | None = None
@@ -57,7 +58,7 @@ class Controls:
         with tabs.add_tab("Trial"):
             self._trial = TrialTab(gui, catalog, first, model, changed)
         with tabs.add_tab("Robot"):
-            self._robot = RobotTab(gui, changed)
+            self._robot = RobotTab(gui, changed, control)
             self._compare = CompareFolder(gui, changed)
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
