@@ -157,6 +157,7 @@ PANEL_CSS = """
 .mv-table th { font-weight: 500; text-align: right; vertical-align: bottom; padding: 2px 0 2px 6px; }
 .mv-table tr > th:first-child { text-align: left; white-space: nowrap; padding-left: 0; }
 .mv-table td { text-align: right; padding: 2px 0 2px 6px; border-top: 1px solid var(--mantine-color-default-border); }
+.mv-table td:first-child { text-align: left; padding-left: 0; }
 .mv-table tr + tr th { border-top: 1px solid var(--mantine-color-default-border); }
 .mv-note b { color: var(--mantine-color-text); }
 .mv-note code { font-size: 11px; }
