@@ -74,7 +74,7 @@ class Controls:
         """What the widgets say, checked. Raises UserError naming the widget."""
         infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
-        control = self._robot.read(checkpoint, trial, contact_states)
+        control = self._robot.read(checkpoint, trial, robot, contact_states)
         view = replace(self._view.read(), compared=self._compare.read(), compliance=self.compliance.read())
         return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 

@@ -105,8 +105,10 @@ CHART_CSS = """
   font-size: 10px; font-weight: 600; overflow: hidden; }
 .mv-states { height: 17px; }
 .mv-states.mv-with-phase { height: 29px; }
-.mv-states.mv-fired { height: 26px; }
-.mv-fired .mv-name small { margin-top: 2px; }
+.mv-fired { height: 26px; }
+.mv-fired .mv-name { align-self: flex-start; padding-top: 1px; }
+.mv-fired .mv-name small { margin-top: 2px; line-height: 11px; }
+.mv-fired .mv-plot { border-bottom: none; }
 .mv-fired .mv-strip { height: 12px; }
 .mv-safety { position: absolute; left: 0; right: 0; top: 13px; height: 12px; }
 .mv-fired .mv-segment { font-weight: 400; font-size: 9px; white-space: nowrap; box-sizing: border-box;
