@@ -109,6 +109,9 @@ CONTROLLER_COLORS: dict[str, Rgb] = {
 }  # fmt: skip
 """Colour of each controller's ghost where several are compared, on either background."""
 
+SIMULATED, FORCE = rgb("#12B5CB"), rgb("#E8590C")
+"""The simulated arm's ghost, and the force between the hands, on either background."""
+
 
 def palette(dark: bool) -> Palette:
     """The colours that read on the page's light or dark background."""

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mild_viz.dashboard.scene import body
 from mild_viz.dashboard.scene.compared import ComparedView
+from mild_viz.dashboard.scene.compliance import ComplianceFrames, ComplianceView
 from mild_viz.dashboard.scene.figure import Figure, make_figure, partner_figure
 from mild_viz.dashboard.scene.giver import GiverView
 from mild_viz.dashboard.scene.ground import GroundView
@@ -58,6 +59,7 @@ class Scene:
         self._robot = RobotView(self._server, robot.visuals, robot.link_names, robot.title)
         self._compared = ComparedView(self._server, robot.visuals, robot.link_names)
         self._volume = VolumeView(self._server, robot.chain)
+        self._compliance = ComplianceView(self._server, robot.visuals, robot.link_names)
 
     def set_robot(self, robot: RobotModel) -> None:
         """Draw another robot from the next `show` on; the same one changes nothing."""
@@ -66,7 +68,7 @@ class Scene:
         _ = robot.visuals  # a mesh that cannot be read must not leave the scene without a robot
         with self._lock, self._server.atomic():
             self._rollout = None  # it has poses of other links
-            for view in (self._robot, self._compared, self._volume):
+            for view in (self._robot, self._compared, self._volume, self._compliance):
                 view.remove()
             self._make_robot_views(robot)
 
@@ -100,7 +102,9 @@ class Scene:
                 fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
             self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human, inference.tracked)
-            ghost = view.ghost and not compared  # of too many arms none can be told apart
+            self._compliance.clear()
+            # of too many arms none can be told apart
+            ghost = view.ghost and not compared and view.compliance is None
             self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, ghost)
             self._compared.show([one for one in compared if one.controller != rollout.controller], view.show_robot)
             self._volume.show(colors, view.show_reach and view.show_robot)
@@ -110,6 +114,14 @@ class Scene:
             self._handed.show(handed, inference.time, colors)
             self._figure, self._giver_figure, self._latent_frames = figure, giver, frames
             self._set_frame(min(self._frame, inference.n_windows - 1))
+
+    def show_compliance(self, frames: ComplianceFrames) -> None:
+        """Also draw a simulation of the rollout that is shown, until the next `show`; the solid arm is its command."""
+        with self._lock, self._server.atomic():
+            if self._rollout is not None and self._view is not None and len(frames.texts) == len(self._rollout.contact):
+                self._compliance.show(frames, self._view.show_robot)
+                self._robot.show_command(frames.command_poses, frames.caption)
+                self._set_frame(self._frame)
 
     def set_frame(self, n: int) -> None:
         """Show frame n; one beyond the end shows the last."""
@@ -154,6 +166,7 @@ class Scene:
         self._giver.set_frame(n)
         self._handed.set_frame(n)
         self._robot.set_frame(n)
+        self._compliance.set_frame(n)
         self._compared.set_frame(n)
         self._reach.set_frame(n)
         self._latent.set_frame(n)
