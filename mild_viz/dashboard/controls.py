@@ -11,7 +11,7 @@ import viser
 
 from mild_viz.checkpoint import save_contact_states
 from mild_viz.dashboard.catalog import Catalog
-from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
+from mild_viz.dashboard.readout import distance_html, rules_text, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.compare import CompareFolder
@@ -25,7 +25,7 @@ from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import ControllerFigures
 from mild_viz.rollout import Rollout
-from mild_viz.settings import InferSettings, Settings
+from mild_viz.settings import ControlSettings, InferSettings, Settings
 from mild_viz.trial import CONTACT_ACTIONS
 
 
@@ -42,6 +42,7 @@ class Controls:
         move_camera: Callable[[viser.ClientHandle, str], None],
         write_html: Writer,
         write_csv: Writer,
+        control: ControlSettings,
     ) -> None:
         self._server, self._catalog = server, catalog
         self._rollout: Rollout | None = None
@@ -57,7 +58,7 @@ class Controls:
         with tabs.add_tab("Trial"):
             self._trial = TrialTab(gui, catalog, first, model, changed)
         with tabs.add_tab("Robot"):
-            self._robot = RobotTab(gui, changed)
+            self._robot = RobotTab(gui, changed, control)
             self._compare = CompareFolder(gui, changed)
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
@@ -154,5 +155,5 @@ def now_html(rollout: Rollout, frame: int) -> str:
     emphasis = "<b>{}</b>" if rollout.inference.action in CONTACT_ACTIONS else "{}"
     return (
         f'<div class="mv-header mv-live">{state_html(rollout, frame)} · {stiffness_text(rollout, frame)}<br>'
-        f"{distance_html(rollout, frame, emphasis)}</div>"
+        f"{distance_html(rollout, frame, emphasis)}<br>rules: {rules_text(rollout, frame)}</div>"
     )
