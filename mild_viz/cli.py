@@ -25,6 +25,7 @@ from mild_viz.run_options import (
     documented,
     leave,
 )
+from mild_viz.simulate_command import simulate
 from mild_viz.train_commands import sweep, train, train_baseline
 
 
@@ -214,6 +215,7 @@ COMMANDS = {
     "live": live,
     "rollout": rollout,
     "record": record,
+    "simulate": simulate,
     "import-published": import_published,
 }
 

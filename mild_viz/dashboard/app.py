@@ -14,6 +14,7 @@ from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.dashboard.address import is_loopback, page_url
 from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.compliance import ComplianceStage
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.live.recorded import RecordedSession, open_recorded
 from mild_viz.dashboard.player import Player
@@ -54,7 +55,8 @@ class Dashboard:
         self.timeline = Timeline(self.server, self.player)
         of = pipeline if recorded is None else recorded
         stages = Pipeline(of.infer, of.control)
-        self.session = Session(self.controls.read, stages, self._show, self.controls.report)
+        self.compliance = ComplianceStage(self.scene, self.controls.compliance, self.timeline)
+        self.session = Session(self.controls.read, stages, self._show, self.controls.report, self.compliance.run)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
         self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
         self.session.start()

@@ -15,6 +15,7 @@ from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.compare import CompareFolder
+from mild_viz.dashboard.tabs.compliance import ComplianceTab
 from mild_viz.dashboard.tabs.record import RecordTab, Writer
 from mild_viz.dashboard.tabs.robot import RobotTab
 from mild_viz.dashboard.tabs.states import StatesTab
@@ -62,6 +63,8 @@ class Controls:
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
             self._states.save.on_click(lambda _event: self._save_contact_states())
+        with tabs.add_tab("Force"):
+            self.compliance = ComplianceTab(gui, changed)
         with tabs.add_tab("View"):
             self._view = ViewTab(gui, changed, move_camera)
         with tabs.add_tab("Record"):
@@ -72,7 +75,7 @@ class Controls:
         infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, contact_states)
-        view = replace(self._view.read(), compared=self._compare.read())
+        view = replace(self._view.read(), compared=self._compare.read(), compliance=self.compliance.read())
         return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 
     def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:
