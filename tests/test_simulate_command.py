@@ -15,6 +15,7 @@ def test_it_prints_and_writes_the_comparison(tmp_path: Path, capsys: pytest.Capt
     table, motions = tmp_path / "table.csv", tmp_path / "motions"
     assert cli.main(["simulate", "--trials", "4", "--csv", str(table), "--out", str(motions)]) == 0
     printed = capsys.readouterr().out
+    assert "demo/test, v3.1, mild-ik" in printed
     rows = pd.read_csv(table).set_index(["scenario", "stiffness"])
     assert list(rows.index) == [(s, k) for s in ("commanded", "human-led") for k in ("fixed", "schedule")]
     assert (rows["grips"] == 1).all()

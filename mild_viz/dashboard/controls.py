@@ -11,7 +11,7 @@ import viser
 
 from mild_viz.checkpoint import save_contact_states
 from mild_viz.dashboard.catalog import Catalog
-from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
+from mild_viz.dashboard.readout import distance_html, rules_text, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.compare import CompareFolder
@@ -155,5 +155,5 @@ def now_html(rollout: Rollout, frame: int) -> str:
     emphasis = "<b>{}</b>" if rollout.inference.action in CONTACT_ACTIONS else "{}"
     return (
         f'<div class="mv-header mv-live">{state_html(rollout, frame)} · {stiffness_text(rollout, frame)}<br>'
-        f"{distance_html(rollout, frame, emphasis)}</div>"
+        f"{distance_html(rollout, frame, emphasis)}<br>rules: {rules_text(rollout, frame)}</div>"
     )

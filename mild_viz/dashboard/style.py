@@ -18,7 +18,7 @@ GUTTER = (124, 64)
 TIMELINE_CSS = """
 @supports (anchor-name: --a) {
   [data-dock-region="right"] { anchor-name: --mv-right; }
-  [data-dock-root]:has(.mv-timeline) { --mv-height: clamp(290px, 38vh, 410px); }
+  [data-dock-root]:has(.mv-timeline) { --mv-height: clamp(314px, 40vh, 434px); }
   [data-dock-root]:has(.mv-timeline) > :first-child { bottom: var(--mv-height) !important; }
   [data-floating-window]:has(.mv-timeline) {
     left: 0 !important; top: auto !important; bottom: 0 !important; width: auto !important;
@@ -35,7 +35,7 @@ TIMELINE_CSS = """
 .mv-timeline { display: none; }
 div:has(> div > .mv-timeline) {
   display: grid; grid-template-columns: auto auto auto minmax(0, 1fr); align-items: center; height: 100%;
-  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
+  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
   padding: 2px 0 0 0 !important; box-sizing: border-box;
 }
 div:has(> div > .mv-timeline) > div { padding-bottom: 0 !important; }
@@ -105,6 +105,13 @@ CHART_CSS = """
   font-size: 10px; font-weight: 600; overflow: hidden; }
 .mv-states { height: 17px; }
 .mv-states.mv-with-phase { height: 29px; }
+.mv-states.mv-fired { height: 26px; }
+.mv-fired .mv-name small { margin-top: 2px; }
+.mv-fired .mv-strip { height: 12px; }
+.mv-safety { position: absolute; left: 0; right: 0; top: 13px; height: 12px; }
+.mv-fired .mv-segment { font-weight: 400; font-size: 9px; white-space: nowrap; box-sizing: border-box;
+  border-right: 1px solid var(--mantine-color-body); }
+.mv-lane .mv-plot, .mv-rows { cursor: pointer; }
 .mv-states .mv-name small { margin-top: 4px; line-height: 11px; }
 .mv-states .mv-name { align-self: flex-start; padding-top: 1px; }
 .mv-states .mv-plot { border-bottom: none; }
