@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
-from mild_viz.data.skeletons import ARM_JOINTS, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, joint_indices, to_frame
 from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import observed_rows, unobserved_forward
@@ -256,8 +256,18 @@ def _decision(tick: Tick) -> Decision:
 
 
 def _arm(tick: Tick) -> Float[np.ndarray, "3 3"]:
-    samples = _decision(tick).samples
-    return samples[-1] if samples else np.full((3, 3), np.nan)
+    """The arm as the model took it, else as it was sent, in the person's own frame; NaN where nothing came."""
+    decision = _decision(tick)
+    if decision.samples:
+        return decision.samples[-1]
+    if tick.seen is None:
+        return np.full((3, 3), np.nan)
+    return _in_person(tick, tick.seen.positions[joint_indices(tick.seen.names, ARM_JOINTS)])
+
+
+def _in_person(tick: Tick, points: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+    T = _decision(tick).T_world_person
+    return points if T is None else to_frame(T, points)
 
 
 def _skeleton(ticks: tuple[Tick, ...]) -> Skeleton | None:
@@ -268,6 +278,5 @@ def _skeleton(ticks: tuple[Tick, ...]) -> Skeleton | None:
     positions = np.full((len(ticks), len(names), 3), np.nan)
     for row, tick in zip(positions, ticks, strict=True):
         if tick.seen is not None and tick.seen.names == names:
-            T = _decision(tick).T_world_person
-            row[:] = tick.seen.positions if T is None else to_frame(T, tick.seen.positions)
+            row[:] = _in_person(tick, tick.seen.positions)
     return Skeleton(names, skeleton_bones(names), positions)
