@@ -20,15 +20,14 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_rate, window_errors
 from mild_viz.prediction import predict
-from mild_viz.robot.carried import carry_object
-from mild_viz.robot.contact import in_frame, transfer_frame
+from mild_viz.robot.contact import in_frame, nearest_wrists
 from mild_viz.robot.control.controller import Frames, make_controller
 from mild_viz.robot.control.other_arm import move_other_arms
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import WINDOW, ControlSettings
-from mild_viz.trial import ObjectTrack, Skeleton, Trial
+from mild_viz.trial import Trial
 
 NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
@@ -60,7 +59,6 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
 
     newest = slice(NEWEST, NEWEST + n_windows)
     first = slice(WINDOW, WINDOW + n_windows)
-    transfer = transfer_frame(trial)
     return Inference(
         dataset=trial.dataset,
         split=trial.split,
@@ -91,10 +89,10 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         robot_state_covariances=hmm.emission_covariances[:, partner, partner],
         human_arm=trial.human_arm[newest],
         human_hand=arm[newest, 2],
-        human_skeleton=_rows_of(trial.human_skeleton, newest),
-        partner_skeleton=_rows_of(_partner_seen_by_human(trial), newest),
-        object_track=None if trial.object_track is None else _track_rows(trial.object_track, newest),
-        handed_over=None if transfer is None else int(np.clip(transfer - NEWEST, 0, n_windows - 1)),
+        human_skeleton=None if trial.human_skeleton is None else trial.human_skeleton.rows(newest),
+        partner_skeleton=None if trial.partner_skeleton is None else trial.partner_skeleton.rows(newest),
+        object_track=None if trial.object_track is None else trial.object_track.rows(newest),
+        transfer=transfer_row(trial, n_windows),
         phase=None if trial.phase is None else trial.phase[newest],
         decodes=decoding.decodes,
         partner_decoded=moved.partner,
@@ -137,11 +135,6 @@ def control(
         {arm.name: getattr(arm, f"joints_{kind}") for arm in others} for kind in ("commanded", "decoded")
     )
     end_effector = robot.end_effector(result.joints)
-    link_poses = robot.link_poses(result.joints, inference.action, commanded)
-    carried = None
-    if inference.object_track is not None and inference.handed_over is not None:
-        hand = link_poses[:, robot.hand_link, :4]
-        carried = carry_object(inference.object_track, inference.handed_over, placed.T_world_human, end_effector, hand)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
         inference=inference,
@@ -158,16 +151,23 @@ def control(
         fired=result.fired,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
-        link_poses=link_poses,
+        link_poses=robot.link_poses(result.joints, inference.action, commanded),
         link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action, decoded),
         state_durations=durations,
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),
         placement=placed.placement,
-        object_poses=None if carried is None else carried.poses,
-        object_by_robot=None if carried is None else carried.by_robot,
+        T_world_partner=partner_pose(trial, placed.T_world_human),
+        object_track=None if inference.object_track is None else inference.object_track.seen_from(placed.T_world_human),
         other_arms=others,
     )
+
+
+def partner_pose(trial: Trial, T_robot_human: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"] | None:
+    """Where the recorded partner stands, with the human where the robot has it; None without one world frame."""
+    if trial.T_world_human is None or trial.T_world_partner is None:
+        return None
+    return T_robot_human @ np.linalg.inv(trial.T_world_human) @ trial.T_world_partner
 
 
 def with_contact_states(
@@ -197,19 +197,7 @@ def state_visits(
     return steps / np.maximum(visits, 1) / rate, steps / len(active)
 
 
-def _rows_of(skeleton: Skeleton | None, rows: slice) -> Skeleton | None:
-    return None if skeleton is None else Skeleton(skeleton.joint_names, skeleton.bones, skeleton.positions[rows])
-
-
-def _track_rows(track: ObjectTrack, rows: slice) -> ObjectTrack:
-    return ObjectTrack(track.positions[rows], track.wxyzs[rows])
-
-
-def _partner_seen_by_human(trial: Trial) -> Skeleton | None:
-    """The partner's whole body in the human's frame; None where it, or one common world frame, was not recorded."""
-    body, T_world_human, T_world_partner = trial.partner_skeleton, trial.T_world_human, trial.T_world_partner
-    if body is None or T_world_human is None or T_world_partner is None:
-        return None
-    T_human_partner = np.linalg.inv(T_world_human) @ T_world_partner
-    points = in_frame(T_human_partner, body.positions.reshape(-1, 3))
-    return Skeleton(body.joint_names, body.bones, points.reshape(body.positions.shape))
+def transfer_row(trial: Trial, n_windows: int) -> int | None:
+    """The window whose newest observation is that of the transfer; None where no object or no world was recorded."""
+    frame = None if trial.object_track is None else nearest_wrists(trial)
+    return None if frame is None else min(max(frame - NEWEST, 0), n_windows - 1)

@@ -77,11 +77,11 @@ class Inference:
     human_skeleton: Skeleton | None = None
     """The whole body at the newest observations, human frame, where it was recorded."""
     partner_skeleton: Skeleton | None = None
-    """The recorded partner's whole body at the newest observations, in the human's frame; None where unknown."""
+    """The same of the second human, in that person's own frame."""
     object_track: ObjectTrack | None = None
-    """What is handed over, as recorded, in the human's frame."""
-    handed_over: int | None = None
-    """The row in which the recorded hands are nearest, where there is an object."""
+    """What is handed over at the newest observations, human frame, where it was recorded."""
+    transfer: int | None = None
+    """Row at which it is handed over: the two persons' wrists are nearest."""
     phase: Int[np.ndarray, " N"] | None = None
     decodes: str = "joints"
     """What the model decodes of the partner: a key of `ERROR_UNITS`."""
@@ -174,10 +174,10 @@ class Rollout:
     contact_states: frozenset[int]
     placement: Placement
     """Where the human stands, and in words for the page where that comes from."""
-    object_poses: Float[np.ndarray, "N 7"] | None = None
-    """Pose in world of the object that is handed over: wxyz, xyz [m]; None without one, NaN where unknown."""
-    object_by_robot: Bool[np.ndarray, " N"] | None = None
-    """Whether the robot holds the object; else it is drawn as recorded."""
+    T_world_partner: Float[np.ndarray, "4 4"] | None = None
+    """Pose of the recorded second human's own frame; None where each person was recorded apart."""
+    object_track: ObjectTrack | None = None
+    """What is handed over as it was recorded, world."""
     other_arms: tuple[OtherArm, ...] = ()
     """The arms that move beside the one that interacts; those that only rest are not among them."""
 

@@ -43,10 +43,14 @@ class Skeleton:
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
+    def rows(self, rows: slice) -> Skeleton:
+        """Some of its frames."""
+        return Skeleton(self.joint_names, self.bones, self.positions[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """Pose over time of an object that is handed over, in the human's own frame; NaN where it was not tracked."""
+    """Pose over time of an object that is handed over, NaN where it was not tracked; a trial's in the human's frame."""
 
     positions: Float[np.ndarray, "T 3"]
     """The tracked point of the object [m]."""
@@ -55,6 +59,19 @@ class ObjectTrack:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    def seen_from(self, T_frame_human: Float[np.ndarray, "4 4"]) -> ObjectTrack:
+        """The same track in another frame, in which the human's own has the given pose."""
+        from scipy.spatial.transform import Rotation  # slow to import, and few recordings have an object
+
+        wxyzs, known = self.wxyzs.copy(), np.isfinite(self.wxyzs).all(axis=1)
+        turned = Rotation.from_matrix(T_frame_human[:3, :3]) * Rotation.from_quat(wxyzs[known][:, [1, 2, 3, 0]])
+        wxyzs[known] = turned.as_quat()[:, [3, 0, 1, 2]]
+        return ObjectTrack(self.positions @ T_frame_human[:3, :3].T + T_frame_human[:3, 3], wxyzs)
+
+    def rows(self, rows: slice) -> ObjectTrack:
+        """Some of its frames."""
+        return ObjectTrack(self.positions[rows], self.wxyzs[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ def test_nothing_overlaps_or_overflows(paused: Page, dashboard: Dashboard, width
     overflowing = """() => [...document.querySelectorAll('.mv-name, .mv-now, .mv-range span, .mv-header, .mv-note')]
         .filter(e => e.offsetParent && (e.scrollWidth > e.clientWidth + 1) && getComputedStyle(e).display !== 'inline')
         .map(e => e.innerText)"""
-    for name in ("Trial", "Robot", "States", "View", "Record"):
+    for name in ("Trial", "Robot", "States", "Force", "View", "Record"):
         tab(page, name)
         assert page.evaluate(overflowing) == [], name
         region = page.locator("[data-dock-region='right'] [data-scrollarea-viewport]").first

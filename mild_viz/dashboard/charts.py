@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from mild_viz.robot.control.rules import RULES, fired_rules
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import STATE_COLORS
+from mild_viz.simulation.compare import Comparison
 from mild_viz.trial import CONTACT_ACTIONS, PHASES
 
 WIDTH, HEIGHT = 1000, 1000
@@ -250,6 +251,19 @@ def _distance(rollout: Rollout) -> str:
         + (_line(stiffness, 0.0, 1.06, "mv-stiffness") if varies else "")
     )
     return _lane("Robot hand to wrist", "dotted: stiffness" if varies else "", plot, (f"{high:.0f} cm", "0"))
+
+
+def force_lane(rollout: Rollout, comparison: Comparison) -> str:
+    """The largest force between the hands since the frame before, with full stiffness and with the schedule."""
+    fixed, schedule = (comparison.motions[name] for name in ("fixed", "schedule"))
+    high = max(float(fixed.force_peak.max()), float(schedule.force_peak.max()), 1.0)
+    plot = _svg(
+        _grid(rollout.inference)
+        + _bands(schedule.gripped, "mv-touch")
+        + _line(fixed.force_peak, 0.0, 1.06 * high, "mv-full")
+        + _line(schedule.force_peak, 0.0, 1.06 * high, "mv-commanded")
+    )
+    return _lane("Hand force", "dashed: full stiffness", plot, (f"{high:.0f} N", "0"), "mv-force")
 
 
 def tick_times(start: float, end: float) -> list[float]:

@@ -61,6 +61,12 @@ div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-InputWrapper-root {
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-Slider-root { margin-inline: -3.7px; }
 div:has(> div > .mv-timeline) > div:nth-child(4) input { display: block; }
 .mv-lane { height: 100%; }
+[data-dock-root]:has(.mv-force) { --mv-height: clamp(330px, 43vh, 450px) !important; }
+div:has(> div > .mv-timeline):has(.mv-force) {
+  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) minmax(28px, 5fr) 14px;
+}
+div:has(> div > .mv-timeline) > div:has(> .mv-force) { order: 1; }
+div:has(> div > .mv-timeline) > div:has(> .mv-axis) { order: 2; }
 """
 TIMELINE_CSS = TIMELINE_CSS.replace("LEFT", str(GUTTER[0]))
 
@@ -88,6 +94,7 @@ CHART_CSS = """
 .mv-plot .mv-touch { fill: var(--mantine-color-text); opacity: 0.08; }
 .mv-commanded { stroke: var(--mantine-color-text); }
 .mv-stiffness { stroke: var(--mantine-color-dimmed); stroke-dasharray: 2 3; }
+.mv-full { stroke: #e8590c; stroke-dasharray: 5 3; }
 .mv-decoded { stroke: #1c7ed6; stroke-dasharray: 5 3; }
 .mv-truth { stroke: #f08c00; stroke-width: 3 !important; opacity: 0.55; }
 .mv-cursor {
@@ -152,6 +159,7 @@ PANEL_CSS = """
 .mv-table th { font-weight: 500; text-align: right; vertical-align: bottom; padding: 2px 0 2px 6px; }
 .mv-table tr > th:first-child { text-align: left; white-space: nowrap; padding-left: 0; }
 .mv-table td { text-align: right; padding: 2px 0 2px 6px; border-top: 1px solid var(--mantine-color-default-border); }
+.mv-table td:first-child { text-align: left; padding-left: 0; }
 .mv-table tr + tr th { border-top: 1px solid var(--mantine-color-default-border); }
 .mv-note b { color: var(--mantine-color-text); }
 .mv-note code { font-size: 11px; }

@@ -45,8 +45,7 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     if trial.phase is not None:
         return seen & (trial.phase == PHASES.index("contact"))
     if trial.T_world_human is not None and trial.T_world_partner is not None:
-        gap = in_frame(trial.T_world_human, human[:, 2]) - in_frame(trial.T_world_partner, partner[:, 2])
-        distance = np.linalg.norm(gap, axis=1)
+        distance = _wrist_distance(trial.T_world_human, human, trial.T_world_partner, partner)
         return seen & (distance <= np.nanmin(distance) + CLOSE)
     extension = np.minimum(_extension(human), _extension(partner))
     largest = np.nanquantile(extension, 0.98)
@@ -57,17 +56,22 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     return seen & (extension >= EXTENDED * largest) & (speed < TOGETHER)
 
 
-def transfer_frame(trial: Trial) -> int | None:
-    """The frame in which the two right wrists are nearest: when an object changes hands.
-
-    None without an object, and where the two people were not recorded in one world frame.
-    """
-    partner, T_world_human, T_world_partner = trial.partner_arm, trial.T_world_human, trial.T_world_partner
-    if trial.object_track is None or partner is None or T_world_human is None or T_world_partner is None:
+def nearest_wrists(trial: Trial) -> int | None:
+    """The frame in which the partners' right wrists are nearest; None where they were not recorded in one world."""
+    T_world_human, T_world_partner, partner = trial.T_world_human, trial.T_world_partner, trial.partner_arm
+    if T_world_human is None or T_world_partner is None or partner is None:
         return None
-    gap = in_frame(T_world_human, trial.human_arm[:, 2]) - in_frame(T_world_partner, partner[:, 2])
-    distance = np.linalg.norm(gap, axis=1)
-    return int(np.nanargmin(distance)) if np.isfinite(distance).any() else None
+    distance = _wrist_distance(T_world_human, trial.human_arm, T_world_partner, partner)
+    return None if np.isnan(distance).all() else int(np.nanargmin(distance))
+
+
+def _wrist_distance(
+    T_world_human: Float[np.ndarray, "4 4"],
+    human: Float[np.ndarray, "T 3 3"],
+    T_world_partner: Float[np.ndarray, "4 4"],
+    partner: Float[np.ndarray, "T 3 3"],
+) -> Float[np.ndarray, " T"]:
+    return np.linalg.norm(in_frame(T_world_human, human[:, 2]) - in_frame(T_world_partner, partner[:, 2]), axis=1)
 
 
 def suggest_contact_states(

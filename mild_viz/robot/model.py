@@ -73,12 +73,6 @@ class RobotModel:
         return load_visuals(self.description)
 
     @cached_property
-    def hand_link(self) -> int:
-        """Place in `link_names` of the drawn link that carries the end effector (the first, if none does)."""
-        links = [joint.child for joint in reversed(self.description.path_to(self.chain.end_effector))]
-        return next((self.link_names.index(link) for link in links if link in self.link_names), 0)
-
-    @cached_property
     def floor(self) -> float:
         """Height of the floor that the resting robot stands on, in the base frame [m]."""
         footprint = [joint.child for joint in self.description.joints if joint.child == "base_footprint"]

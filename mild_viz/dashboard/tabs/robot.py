@@ -25,8 +25,7 @@ REACH = 0.5
 class RobotTab:
     """Widgets of `ControlSettings`, but for the contact states."""
 
-    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
-        default = ControlSettings()
+    def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS, initial_value=default.controller,
             hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states.",

@@ -7,17 +7,11 @@ from collections.abc import Callable
 import viser
 
 from mild_viz.dashboard.scene.scene import CAMERAS
-from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, option, set_content
+from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, option
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.errors import UserError
 from mild_viz.rollout import Rollout
 from mild_viz.settings import ALPHA_MODES
-
-OBJECT_NOTE = (
-    "The object is in the robot's hand until the recorded hands are nearest, and from then on where it was recorded, "
-    "in the receiver's hand. Its shape was not recorded. The giver stands as recorded, seen from the receiver; the "
-    "robot is placed so that the hands meet."
-)
 
 PCA, DIMENSIONS = "principal components", "dimensions"
 
@@ -58,27 +52,19 @@ class ViewTab:
         self._reach = gui.add_checkbox(
             "Reach volume", default.show_reach, hint="Draw how far the robot's hand reaches in every direction."
         )
-        self._giver = gui.add_checkbox(
-            "Recorded giver", default.show_giver, hint="In a handover, draw the person whose place the robot takes."
-        )
         self._visible = {
             group: gui.add_checkbox(f"Show {group}", True, hint=f"Draw the {group}.")
             for group in ("human", "robot", "latent plot")
         }
-        self._note = gui.add_html("")
+        self._giver = gui.add_checkbox(
+            "Show giver", default.show_giver, visible=False,
+            hint="Draw the recorded giver, grey (legs schematic), in the robot's place. The object is in the robot's "
+            "hand until the recorded transfer, then as recorded; without the robot it is as recorded all along.",
+        )  # fmt: skip
         self._axis_names = ["z0", "z1", "z2"]
         """What the axes were at the last reading."""
-        widgets = (
-            self._theme,
-            self._alpha,
-            self._sigma,
-            self._axes,
-            *self._dimensions,
-            self._ghost,
-            self._reach,
-            self._giver,
-        )
-        for handle in (*widgets, *self._visible.values()):
+        widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost, self._reach)
+        for handle in (*widgets, self._giver, *self._visible.values()):
             on_person(handle, changed)
 
         @self._camera.on_click
@@ -108,17 +94,16 @@ class ViewTab:
             sigma=number(self._sigma),
             ghost=bool(self._ghost.value),
             show_reach=bool(self._reach.value),
-            show_giver=bool(self._giver.value),
             show_human=human,
+            show_giver=bool(self._giver.value),
             show_robot=robot,
             show_latent=latent,
             dark=option(self._theme) == "dark",
         )
 
     def show(self, rollout: Rollout) -> None:
-        """Offer the latent dimensions that the model has."""
-        self._giver.disabled = rollout.object_poses is None
-        set_content(self._note, f'<div class="mv-note">{OBJECT_NOTE}</div>' if rollout.object_poses is not None else "")
+        """Offer the latent dimensions that the model has, and the giver where one was recorded in the same world."""
+        self._giver.visible = rollout.T_world_partner is not None and rollout.inference.partner_skeleton is not None
         n_dimensions = rollout.inference.human_latent_mean.shape[1]
         names = [f"z{i}" for i in range(n_dimensions)]
         for handle in self._dimensions:
