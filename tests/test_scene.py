@@ -32,6 +32,7 @@ from mild_viz.dashboard.scene.scene import Scene
 from mild_viz.dashboard.scene.shapes import ball, limb, limb_poses, quaternion_from_matrix, rotate
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.errors import UserError
+from mild_viz.robot.control.rules import OUT_OF_REACH
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.rollout import Rollout
 
@@ -201,12 +202,27 @@ def test_the_gap_between_the_hands_is_drawn_and_written(
         text = node(server, "/reach/distance").text
         assert text.startswith(f"{100.0 * rollout.hand_distance[n]:.1f} cm")
         assert text.endswith("contact state") == rollout.contact[n]
+        assert not text.endswith("out of reach") and node(server, "/reach/target").color == LIGHT.distance
+        np.testing.assert_allclose(node(server, "/reach/target").position, rollout.target[n], atol=1e-6)
+    fired = rollout.fired.copy()
+    fired[n] |= 1 << OUT_OF_REACH
+    scene.show(replace(rollout, fired=fired), ViewSettings())
+    assert node(server, "/reach/distance").text.endswith("contact state · out of reach")
+    assert node(server, "/reach/target").color == LIGHT.unreachable
+    scene.set_frame(n + 1)
+    assert node(server, "/reach/target").color == LIGHT.distance
+    scene.set_frame(n)
     for distance, marked in ((0.049, True), (0.11, False)):
         scene.show(replace(rollout, hand_distance=np.full_like(rollout.hand_distance, distance)), ViewSettings())
         assert node(server, "/reach/contact").visible == marked, "a contact state alone is not a touch"
     far = replace(rollout, hand_distance=np.full_like(rollout.hand_distance, np.nan))
     scene.show(far, ViewSettings())
     assert not node(server, "/reach/line").visible and not node(server, "/reach/distance").visible
+    lost = replace(rollout, inference=replace(rollout.inference, tracked=np.zeros_like(rollout.inference.tracked)))
+    scene.show(lost, ViewSettings())
+    assert node(server, "/reach/target").visible, "the controller holds on to where the hand was seen last"
+    scene.show(replace(rollout, target=np.full_like(rollout.target, np.nan)), ViewSettings())
+    assert not node(server, "/reach/target").visible
 
 
 def test_human_and_robot_face_each_other_in_true_scale(

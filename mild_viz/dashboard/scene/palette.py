@@ -53,6 +53,8 @@ class Palette:
     """The predicted trajectory."""
     contact: Rgb
     distance: Rgb
+    unreachable: Rgb
+    """A target that the arm cannot get to."""
     grid: Rgb
     grid_section: Rgb
     pedestal: Rgb
@@ -78,6 +80,7 @@ LIGHT = Palette(
     dashes=rgb("#0B2F6B"),
     contact=rgb("#009E73"),
     distance=rgb("#30343B"),
+    unreachable=rgb("#E8590C"),
     grid=rgb("#E7EAEE"),
     grid_section=rgb("#D3D8DF"),
     pedestal=rgb("#C9CFD6"),
@@ -96,6 +99,7 @@ DARK = Palette(
     dashes=rgb("#C6E2FF"),
     contact=rgb("#2BD6A0"),
     distance=rgb("#E6E9EE"),
+    unreachable=rgb("#FFA94D"),
     grid=rgb("#444D59"),
     grid_section=rgb("#525C69"),
     pedestal=rgb("#5E6874"),

@@ -1,13 +1,14 @@
-"""The gap between the robot's hand and the human's: a line with its length, and where they touch."""
+"""The gap between the robot's hand and the human's: a line with its length, where they touch, and the target."""
 
 from __future__ import annotations
 
 import numpy as np
 import viser
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mild_viz.dashboard.scene.labels import NOTE, add_label
 from mild_viz.dashboard.scene.palette import Palette
+from mild_viz.robot.control.rules import OUT_OF_REACH
 from mild_viz.rollout import Rollout
 
 ROOT = "/reach"
@@ -27,6 +28,9 @@ class ReachView:
         self._contact = server.scene.add_icosphere(
             f"{ROOT}/contact", radius=0.085, opacity=0.3, cast_shadow=False, receive_shadow=False
         )
+        self._target = server.scene.add_icosphere(
+            f"{ROOT}/target", radius=0.07, subdivisions=1, wireframe=True, cast_shadow=False, receive_shadow=False
+        )
         self._text = add_label(server, f"{ROOT}/distance", "", NOTE, "top-center")
         self._rollout: Rollout | None = None
 
@@ -37,6 +41,9 @@ class ReachView:
         self._ends = np.nan_to_num(np.stack([rollout.end_effector, rollout.target], axis=1))
         self._texts = distance_texts(rollout)
         self._label_positions = np.nan_to_num(label_positions(rollout))
+        self._unreachable = out_of_reach(rollout)
+        self._aimed: Bool[np.ndarray, " N"] = np.isfinite(rollout.target).all(axis=1)
+        self._target_colors = {True: colors.unreachable, False: colors.distance}
         self._known = np.isfinite(rollout.hand_distance) & rollout.inference.tracked
         # One colour for the whole line, from its creation on: the browser does not recompile a line whose colours
         # change from one to many.
@@ -52,6 +59,10 @@ class ReachView:
             return
         known, contact = bool(self._known[n]), bool(self._rollout.contact[n])
         self._line.visible = self._text.visible = known
+        # where the controller believes the hand to be: while tracking is lost, where it was seen last
+        self._target.visible = bool(self._aimed[n])
+        self._target.position = self._ends[n, 1]
+        self._target.color = self._target_colors[bool(self._unreachable[n])]
         self._contact.visible = known and contact and bool(self._rollout.hand_distance[n] < TOUCH)
         if not known:
             return
@@ -65,9 +76,16 @@ class ReachView:
 def distance_texts(rollout: Rollout) -> list[str]:
     """What is written at the line in every frame."""
     return [
-        f"{100.0 * distance:.1f} cm" + (" · contact state" if contact else "")
-        for distance, contact in zip(rollout.hand_distance.tolist(), rollout.contact.tolist(), strict=True)
+        f"{100.0 * distance:.1f} cm" + (" · contact state" if contact else "") + (" · out of reach" if far else "")
+        for distance, contact, far in zip(
+            rollout.hand_distance.tolist(), rollout.contact.tolist(), out_of_reach(rollout).tolist(), strict=True
+        )
     ]
+
+
+def out_of_reach(rollout: Rollout) -> Bool[np.ndarray, " N"]:
+    """Where the controller wanted the hand and could not get there: the rule of that name."""
+    return (rollout.fired >> OUT_OF_REACH & 1).astype(bool)
 
 
 def label_positions(rollout: Rollout) -> Float[np.ndarray, "N 3"]:
