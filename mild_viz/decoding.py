@@ -19,7 +19,7 @@ from mild_viz.pairs import retarget, retargeted_truth, robot_truth
 from mild_viz.robot.contact import arm_lengths
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.robots import robot_of
-from mild_viz.trial import Trial
+from mild_viz.trial import ARM_POINTS, Trial
 
 
 class Truth(NamedTuple):
@@ -87,7 +87,7 @@ class ArmDecoding:
         The hand keeps its share of that arm's own length: no length of a person has to be known. The robot's base takes
         the place of the person's own frame, as if that stood upright: how a partner leans, nobody predicts.
         """
-        partner = decoded[:, :9].reshape(-1, 3, 3)
+        partner = points_of(decoded, len(ARM_POINTS))
         joints = retarget(self.robot, partner, self.rate, length=arm_lengths(partner), previous=carry)
         return Moved(joints, partner, joints[-1] if len(joints) else carry)
 
@@ -98,6 +98,11 @@ class ArmDecoding:
 
 
 Decoding = JointDecoding | ArmDecoding
+
+
+def points_of(features: Float[np.ndarray, "N Y"], n_points: int) -> Float[np.ndarray, "N P 3"]:
+    """The positions of a person's points in the first frame of each row of features or windows."""
+    return features[:, : 3 * n_points].reshape(-1, n_points, 3)
 
 
 def open_robot(checkpoint: Checkpoint, robot: str | None = None) -> RobotModel:

@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
-from mild_viz.decoding import decoding_of, open_robot
+from mild_viz.decoding import decoding_of, open_robot, points_of
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
-from mild_viz.pairs import check_rate, window_errors
+from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import initial_carry, run_controller
@@ -26,7 +26,7 @@ from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import WINDOW, ControlSettings
-from mild_viz.trial import Skeleton, Trial
+from mild_viz.trial import WRIST, Skeleton, Trial
 
 NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
@@ -43,11 +43,13 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
     """
     decoding = decoding_of(checkpoint, robot or open_robot(checkpoint), trial.rate)
     check_rate(checkpoint.rate, checkpoint.name, [trial])
+    check_points(checkpoint.points, checkpoint.name, [trial])
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
         raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")
-    arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
-    said = predict(checkpoint, variant, trial.action, human_windows(arm)[:n_windows])
+    seen = trial.human_points
+    points = fill_gaps(seen, max_gap(trial.rate))
+    said = predict(checkpoint, variant, trial.action, human_windows(points)[:n_windows])
 
     model = checkpoint.members(variant)[0]
     hmm, size = model.hmms[trial.action], model.human_vae.latent_size
@@ -68,7 +70,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         joint_names=decoding.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
         observed=observed_rows(said.human_mean),
-        tracked=observed_rows(trial.human_arm[newest].reshape(n_windows, -1)),
+        tracked=observed_rows(seen[newest].reshape(n_windows, -1)),
         log_alpha_human=said.log_alpha,
         log_alpha_joint=joint_log_alpha(model, trial.action, said.human_mean, latent_truth),
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),
@@ -87,12 +89,12 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         robot_state_means=hmm.emission_means[:, partner],
         robot_state_covariances=hmm.emission_covariances[:, partner, partner],
         human_arm=trial.human_arm[newest],
-        human_hand=arm[newest, 2],
+        human_hand=points[newest, checkpoint.points.index(WRIST)],
         human_skeleton=_rows_of(trial.human_skeleton, newest),
         phase=None if trial.phase is None else trial.phase[newest],
         decodes=decoding.decodes,
         partner_decoded=moved.partner,
-        partner_truth=None if moved.partner is None else truth.features[first, :9].reshape(-1, 3, 3),
+        partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
     )
 
 

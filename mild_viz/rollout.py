@@ -79,9 +79,9 @@ class Inference:
     phase: Int[np.ndarray, " N"] | None = None
     decodes: str = "joints"
     """What the model decodes of the partner: a key of `ERROR_UNITS`."""
-    partner_decoded: Float[np.ndarray, "N 3 3"] | None = None
+    partner_decoded: Float[np.ndarray, "N P 3"] | None = None
     """The second human's arm that was decoded, in that person's own frame [m]; None where joints were."""
-    partner_truth: Float[np.ndarray, "N 3 3"] | None = None
+    partner_truth: Float[np.ndarray, "N P 3"] | None = None
     """The same as recorded; NaN where the truth is unknown."""
 
     def __post_init__(self) -> None:

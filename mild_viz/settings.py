@@ -9,8 +9,11 @@ from mild_viz.errors import UserError
 WINDOW = 5
 """Observations in one window (Sec. V-B of the paper)."""
 
-HUMAN_FEATURES = 18
-"""Human features of one frame: three arm joints, position and velocity."""
+POINT_FEATURES = 6
+"""Features of one point of a person in one frame: position and velocity."""
+
+ARM_FEATURES = 3 * POINT_FEATURES
+"""Those of an arm: shoulder, elbow, wrist."""
 
 STATE_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C8C8C")
 """Colour of each HMM state, after Okabe and Ito (safe for colour-blind readers)."""

@@ -20,7 +20,8 @@ from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import HUMAN_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.settings import POINT_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.trial import WRIST
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +29,8 @@ class StreamModel:
     """What does not change between observations."""
 
     models: tuple[InteractionModel, ...]
+    points: tuple[str, ...]
+    """What is observed of the human (`Checkpoint.points`)."""
     variant: str
     action: str
     robot: RobotModel
@@ -47,11 +50,11 @@ class Carry(NamedTuple):
     features: Float[np.ndarray, "W F"]
     """The last window of features; NaN where not observed."""
     n_frames: int
-    last_seen: Float[np.ndarray, "3 3"] | None
-    """The last complete arm."""
+    last_seen: Float[np.ndarray, "P 3"] | None
+    """The last complete observation."""
     gap: int
     """Frames since it was seen."""
-    previous: Float[np.ndarray, " 9"] | None
+    previous: Float[np.ndarray, "P 3"] | None
     """The previous frame's filled position."""
     models: tuple[ModelCarry, ...]
     decoding: Float[np.ndarray, " J"]
@@ -88,6 +91,7 @@ def stream_model(
     settings = with_contact_states(settings, checkpoint, variant, action)
     return StreamModel(
         models=checkpoint.members(variant),
+        points=checkpoint.points,
         variant=variant,
         action=action,
         robot=robot,
@@ -102,17 +106,17 @@ def stream_model(
 
 def start(model: StreamModel) -> Carry:
     """The state before the first observation."""
-    empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
+    empty = np.full((WINDOW, POINT_FEATURES * len(model.points)), np.nan)
     starts = tuple(each.start() for each in model.models)
     return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain))
 
 
-def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tuple[Carry, Command | None]:
-    """Take one observation of the human's arm (shoulder, elbow, wrist [m]; NaN where lost).
+def step(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> tuple[Carry, Command | None]:
+    """Take one observation of the human's `points` (an arm: shoulder, elbow, wrist) [m]; NaN where lost.
 
     Returns the new carry, and the command for the next frame: None until five observations were taken.
     """
-    seen = _observe(model, carry, arm)
+    seen = _observe(model, carry, points)
     if seen.n_frames < WINDOW:
         return seen, None
     window = seen.features.reshape(1, -1)
@@ -120,7 +124,7 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
         window = np.full_like(window, np.nan)
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
     decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
-    hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
+    hand = np.full(3, np.nan) if seen.previous is None else seen.previous[model.points.index(WRIST)]
     target = in_frame(model.T_world_human, hand[None])
     log_transition = said.log_transition if model.uses_transition else None
     result = run_controller(
@@ -141,17 +145,13 @@ def step(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> tup
     return seen._replace(models=models, decoding=following, control=result.carry), command
 
 
-def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
+def _observe(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> Carry:
     """Fill a gap, take the velocity, shift the window: what data.windows does for a whole trial."""
-    if np.isnan(arm).any():
-        gap = carry.gap + 1
-        filled = carry.last_seen if carry.last_seen is not None and gap <= model.max_gap else np.full((3, 3), np.nan)
-        last_seen = carry.last_seen
+    if np.isnan(points).any():
+        gap, last_seen = carry.gap + 1, carry.last_seen
+        filled = last_seen if last_seen is not None and gap <= model.max_gap else np.full_like(points, np.nan)
     else:
-        gap, filled, last_seen = 0, arm, arm
-    position = filled.reshape(9)
-    velocity = np.zeros(9) if carry.previous is None else position - carry.previous
-    features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return carry._replace(
-        features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=position
-    )
+        gap, filled, last_seen = 0, points, points
+    velocity = np.zeros_like(filled) if carry.previous is None else filled - carry.previous
+    features = np.concatenate([carry.features[1:], np.concatenate([filled, velocity]).reshape(1, -1)])
+    return carry._replace(features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=filled)

@@ -15,7 +15,7 @@ from mild_viz.latent.context import ContextLayout
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.robot.placement import Meeting
 from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
-from mild_viz.trial import ACTIONS
+from mild_viz.trial import ACTIONS, ARM_POINTS
 
 SCHEMA_VERSION = 1
 
@@ -41,6 +41,7 @@ class Config:
     state_model: str
     actions: tuple[str, ...]
     robot: RobotInterface | None
+    points: tuple[str, ...]
     rate: float | None
     robot_variants: tuple[str, ...]
     """Those that have a robot VAE on the shared human side."""
@@ -66,6 +67,7 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "state_model": checkpoint.state_model,
         "actions": list(checkpoint.actions),
         "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
+        "points": list(checkpoint.points),
         "rate": checkpoint.rate,
         "variants": {name: asdict(VARIANTS[name]) for name in (*checkpoint.robot_vaes, *checkpoint.own_models)},
         "own_models": {
@@ -245,6 +247,7 @@ def read_config(file: Path) -> Config:
         state_model=_state_model(config.get("state_model", "hmm"), f"{file}: state_model"),
         actions=actions,
         robot=robot,
+        points=names(config.get("points", list(ARM_POINTS)), f"{file}: points"),
         rate=_rate(config.get("rate"), f"{file}: rate"),
         robot_variants=tuple(name for name in variants if name not in own_models),
         own_models=own_models,

@@ -138,6 +138,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         robot_vaes=parts.robot_vaes,
         robot=config.robot,
         own_models=parts.own_models,
+        points=config.points,
         rate=config.rate,
         contact_states=config.contact_states,
         own_contact_states=config.own_contact_states,

@@ -17,6 +17,7 @@ from mild_viz.latent.vae import VAE
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.placement import Meeting
 from mild_viz.settings import VARIANTS, Placement, choose
+from mild_viz.trial import ARM_POINTS
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Checkpoint:
     """None for a human-human model: the partner is then the second human, and the human VAE serves both."""
     own_models: Mapping[str, tuple[InteractionModel, ...]] = field(default_factory=dict)
     """By variant; all of the same actions and sizes."""
+    points: tuple[str, ...] = ARM_POINTS
+    """What it reads of the human, and of a second human (`Trial.points`)."""
     rate: float | None = None
     """Frames a second of the recordings that it was trained on [Hz]; None where that is not known."""
     contact_states: Mapping[str, frozenset[int]] = field(default_factory=dict)

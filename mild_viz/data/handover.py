@@ -8,6 +8,7 @@ giver during a trial, so that the receiver's own frame, which the first tracked 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,10 @@ from jaxtyping import Float
 
 from mild_viz.data.checks import file_checksum
 from mild_viz.data.npz import load_npz
-from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
+from mild_viz.data.skeletons import ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
-from mild_viz.trial import Dataset, Skeleton, Trial
+from mild_viz.trial import ARM_POINTS, HAND_POINTS, Dataset, Skeleton, Trial
 
 FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
 ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
@@ -41,6 +42,19 @@ def read_handover(root: Path) -> Dataset:
     )
 
 
+def read_handover_hands(root: Path) -> Dataset:
+    """The same recordings, of which a model reads both hands of both people: the robot gives with two arms.
+
+    (Sec. Bimanual Robot-to-Human Handovers; there on recordings of two-handed handovers.)
+    """
+    source = read_handover(root)
+    train, test = (
+        tuple(replace(trial, dataset="handover-hands", points=HAND_POINTS) for trial in trials)
+        for trials in (source.train, source.test)
+    )
+    return replace(source, name="handover-hands", title=f"{source.title}: both hands", train=train, test=test)
+
+
 def read_file(path: Path, split: str) -> list[Trial]:
     """The trials of one file: bodies (N, 34, 3) [m], trial after trial; trial i begins at frame `offsets[i]`."""
     arrays = load_npz(path, ARRAYS)
@@ -55,7 +69,7 @@ def read_file(path: Path, split: str) -> list[Trial]:
             T_world_partner, partner = _own_frame(giver[first:last])
         except UserError as error:
             raise UserError(f"{path}: {split} trial {index}: {error}") from error
-        arm = joint_indices(ZED_JOINTS, ARM_JOINTS)
+        arm = joint_indices(ZED_JOINTS, ARM_POINTS)
         trials.append(
             Trial(
                 dataset="handover",

@@ -7,9 +7,6 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 
-ARM_JOINTS = ("right_shoulder", "right_elbow", "right_wrist")
-"""The joints of `Trial.human_arm`, in its order; both body models use these names."""
-
 NUITRACK_JOINTS = (
     "head", "neck", "torso", "waist",
     "left_collar", "left_shoulder", "left_elbow", "left_wrist", "left_hand",
