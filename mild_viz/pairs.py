@@ -56,7 +56,7 @@ def robot_truth(trial: Trial, joint_names: Sequence[str]) -> Float[np.ndarray, "
     """
     if trial.robot_joints is not None and tuple(trial.robot_joint_names) == tuple(joint_names):
         return trial.robot_joints
-    robot = next((name for name, known in ROBOTS.items() if known.joint_names == tuple(joint_names)), None)
+    robot = next((name for name, spec in ROBOTS.items() if spec.joint_names == tuple(joint_names)), None)
     if trial.partner_arm is None or robot is None:
         raise UserError(
             f"trial {trial.name} has no motion for the joints {', '.join(joint_names)}; "
@@ -93,10 +93,10 @@ def retarget(
 ) -> Float[np.ndarray, "T J"]:
     """Joints [rad] of a robot that moves as a person's right arm (shoulder, elbow, wrist [m]) at `rate` [Hz].
 
-    Pepper's arm takes over the angles of the person's, every other one the place of the hand, by
-    `robot.retarget_arm`, which says what the other arguments are.
+    The robot's own rule says how (`ArmSpec.retarget`): Pepper's arm takes over the angles of the person's, every other
+    one the place of the hand, by `robot.retarget_arm`, which says what the other arguments are.
     """
-    if robot.chain.joint_names == ROBOTS["pepper"].joint_names:
+    if robot.spec.main.retarget == "pepper-angles":
         return retarget_pepper(arm)
     return retarget_arm(robot.chain, arm, rate, rotation, length=length, previous=previous)
 

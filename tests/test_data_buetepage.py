@@ -14,7 +14,7 @@ from mild_viz.data.download import fetch
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
 from mild_viz.pairs import stack_windows
-from mild_viz.robot.robots import PEPPER_JOINTS
+from mild_viz.robot.robots import ROBOTS
 
 
 def objects(*items: Any) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_gives_windows_for_both_kinds_of_models(tmp_path: Path) -> None:
     trials = read_buetepage(tmp_path).train
     human = stack_windows(trials, None)
     assert human.human.shape == human.partner.shape == (20 - 9 + 16 - 9, 90) and human.complete.all()
-    robot = stack_windows(trials, PEPPER_JOINTS)
+    robot = stack_windows(trials, ROBOTS["pepper"].joint_names)
     assert robot.partner.shape == (18, 20) and robot.complete.all()
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mild_viz.data.handover import read_handover
-from mild_viz.data.skeletons import NUITRACK_JOINTS, ZED_JOINTS, joint_indices, person_frame, to_world
+from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, ZED_JOINTS, joint_indices, person_frame, to_world
 from mild_viz.errors import UserError
-from mild_viz.trial import ARM_POINTS, Dataset
+from mild_viz.trial import Dataset
 
 Load = Callable[[str], Dataset]
 
@@ -34,7 +34,7 @@ def test_handovers_put_both_bodies_back_into_one_world(dataset: Load, data_root:
             np.testing.assert_allclose(T_world_person[:3, :3] @ T_world_person[:3, :3].T, np.eye(3), atol=1e-12)
             assert np.linalg.det(T_world_person[:3, :3]) > 0
             np.testing.assert_allclose(to_world(T_world_person, body.positions), recorded[role][frames], atol=1e-12)
-            np.testing.assert_array_equal(arm, body.positions[:, joint_indices(ZED_JOINTS, ARM_POINTS)])
+            np.testing.assert_array_equal(arm, body.positions[:, joint_indices(ZED_JOINTS, ARM_JOINTS)])
             wrists.append(
                 to_world(T_world_person, body.positions[:, joint_indices(ZED_JOINTS, ("right_wrist", "left_wrist"))])
             )

@@ -14,10 +14,10 @@ from conftest import unavailable
 from mild_viz.data import commands, nuitrack
 from mild_viz.data.load import load_dataset
 from mild_viz.data.nuisi import RAW_FILES, read_nuisi
-from mild_viz.data.skeletons import NUITRACK_JOINTS, joint_indices
+from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices
 from mild_viz.data.windows import fill_gaps, max_gap, pair_windows
 from mild_viz.errors import UserError
-from mild_viz.trial import ARM_POINTS, Dataset
+from mild_viz.trial import Dataset
 
 Load = Callable[[str], Dataset]
 
@@ -63,7 +63,7 @@ def test_raw_rockets_reproduce_the_published_trials_for_both_persons(dataset: Lo
     nuisi = dataset("nuisi")
     rockets = [trial for trial in nuisi.train + nuisi.test if trial.action == "rocket"]
     assert [trial.split for trial in rockets] == ["train"] * 9 + ["test"] * 3
-    arm = joint_indices(NUITRACK_JOINTS, ARM_POINTS)
+    arm = joint_indices(NUITRACK_JOINTS, ARM_JOINTS)
     for file, person in zip(RAW_FILES, ("human", "partner"), strict=True):
         if not (data_root / file).is_file():
             unavailable(f"{data_root / file} is missing; run: mild-viz data fetch nuisi")

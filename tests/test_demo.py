@@ -20,10 +20,10 @@ from mild_viz.data.demo import (
 )
 from mild_viz.data.demo_body import DEMO_BONES, DEMO_JOINTS, GRIP, two_link
 from mild_viz.data.demo_motion import CONTACT, REACH, REST, RETURN, minimum_jerk, swings
-from mild_viz.data.skeletons import NUITRACK_JOINTS, joint_indices, to_world
-from mild_viz.trial import ARM_POINTS, CONTACT_ACTIONS, Dataset, Trial
+from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices, to_world
+from mild_viz.trial import CONTACT_ACTIONS, Dataset, Trial
 
-ARM = joint_indices(DEMO_JOINTS, ARM_POINTS)
+ARM = joint_indices(DEMO_JOINTS, ARM_JOINTS)
 SHOULDER, ELBOW, WRIST = ARM
 
 

@@ -12,7 +12,7 @@ from urdf_tree import URDFS, Tree, check_generator, check_joints, check_meshes, 
 from mild_viz.data.yumi import JOINT_NAMES
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
-from mild_viz.robot.robots import ROBOTS, YUMI_JOINTS, robot_of
+from mild_viz.robot.robots import ROBOTS, robot_of
 
 BASES = {"panda": "world", "yumi": "yumi_base_link"}
 ADDED = {"panda": (), "yumi": ("gripper_r_tip_joint", "gripper_l_tip_joint")}
@@ -60,7 +60,9 @@ def test_the_chain_is_the_tree_and_every_link_follows_it(robot: str, ours: Tree)
     drawn = set(model.link_names) & set(model.moving_links)
     for row, values in enumerate(joints):
         angles = (
-            dict.fromkeys(ours.joints, 0.0) | model.rest | dict(zip(chain.joint_names, values.tolist(), strict=True))
+            dict.fromkeys(ours.joints, 0.0)
+            | dict(model.spec.rest)
+            | dict(zip(chain.joint_names, values.tolist(), strict=True))
         )
         for name, joint in ours.joints.items():
             follows = joint.find("mimic")
@@ -96,10 +98,10 @@ def test_reach_is_what_the_arm_can_do_not_what_its_links_add_up_to() -> None:
 
 def test_rests_within_the_limits_and_fingers_leave_the_grasp_point(robot: str) -> None:
     model = load_robot(robot)
-    assert set(model.rest) <= {joint.name for joint in model.description.joints}
+    assert set(model.spec.rest) <= {joint.name for joint in model.description.joints}
     assert (model.chain.rest > model.chain.lower).all() and (model.chain.rest < model.chain.upper).all()
     on_path = {joint.name for joint in model.description.path_to(model.chain.end_effector)}
-    for hand in model.hands.values():
+    for hand in model.spec.hands.values():
         assert not on_path & set(hand)
         for name, value in hand.items():
             joint = model.description.joint(name)
@@ -108,7 +110,7 @@ def test_rests_within_the_limits_and_fingers_leave_the_grasp_point(robot: str) -
 
 def test_yumi_is_named_in_the_order_of_the_recordings() -> None:
     # ABB's numbering 1, 2, 7, 3, 4, 5, 6 is the order along the arm: load_chain refuses any other
-    assert YUMI_JOINTS == JOINT_NAMES
+    assert ROBOTS["yumi"].joint_names == JOINT_NAMES
     assert load_robot("yumi").chain.joint_names == JOINT_NAMES
 
 

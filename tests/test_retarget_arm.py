@@ -16,7 +16,7 @@ from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.placement import recorded_placement
 from mild_viz.robot.retarget_arm import LARGEST_FRACTION, MAX_RATE, retarget_arm, scaled_wrist
-from mild_viz.robot.robots import PANDA_JOINTS, PEPPER_JOINTS, YUMI_JOINTS
+from mild_viz.robot.robots import ROBOTS
 from mild_viz.trial import Trial
 
 PANDA = load_robot("panda").chain
@@ -82,7 +82,7 @@ def test_all_handovers_become_motions_that_the_panda_can_make(dataset: Callable[
     handover = dataset("handover")
     errors, touching, spread = [], [], []
     for trial in handover.train + handover.test:
-        joints = robot_truth(trial, PANDA_JOINTS)
+        joints = robot_truth(trial, ROBOTS["panda"].joint_names)
         assert (joints >= PANDA.lower).all() and (joints <= PANDA.upper).all()
         assert np.abs(np.diff(joints, axis=0)).max() <= MAX_RATE / trial.rate + 1e-9
         world = trial.T_world_partner
@@ -98,7 +98,7 @@ def test_all_handovers_become_motions_that_the_panda_can_make(dataset: Callable[
 
 def test_windows_for_training_repeat_exactly(dataset: Callable[[str], Any]) -> None:
     trials = dataset("handover").train[:3]
-    first, second = (stack_windows(trials, PANDA_JOINTS) for _ in range(2))
+    first, second = (stack_windows(trials, ROBOTS["panda"].joint_names) for _ in range(2))
     assert first.partner.shape[1] == 35 and first.complete.all()
     np.testing.assert_array_equal(first.partner, second.partner)
 
@@ -110,7 +110,7 @@ def test_the_hands_meet_where_the_handover_took_place(dataset: Callable[[str], A
         assert placed is not None
         contact = contact_frames(trial)
         receiver = in_frame(placed.T_world_human, trial.human_arm[contact, 2])
-        hand = forward(PANDA, robot_truth(trial, PANDA_JOINTS)[contact])
+        hand = forward(PANDA, robot_truth(trial, ROBOTS["panda"].joint_names)[contact])
         between = np.median(np.linalg.norm(hand - receiver, axis=1))
         assert between < 0.15, trial.name
 
@@ -118,16 +118,16 @@ def test_the_hands_meet_where_the_handover_took_place(dataset: Callable[[str], A
 @pytest.mark.parametrize("name", ["demo", "nuisi"])
 def test_any_partner_can_be_retargeted(name: str, dataset: Callable[[str], Any]) -> None:
     trial = dataset(name).test[0]
-    for joints in (PANDA_JOINTS, YUMI_JOINTS):
+    for joints in (ROBOTS["panda"].joint_names, ROBOTS["yumi"].joint_names):
         truth = robot_truth(trial, joints)
         assert truth.shape == (trial.n_frames, 7) and np.isfinite(truth).all()
-    np.testing.assert_array_equal(robot_truth(trial, PEPPER_JOINTS).shape, (trial.n_frames, 4))
+    np.testing.assert_array_equal(robot_truth(trial, ROBOTS["pepper"].joint_names).shape, (trial.n_frames, 4))
 
 
 def test_without_a_partner_or_a_known_robot_there_is_no_truth() -> None:
     trial = Trial("made", "test", 0, "handover", RATE, human_arm=reaching(), partner_arm=reaching())
-    assert robot_truth(trial, PANDA_JOINTS).shape == (T, 7)
+    assert robot_truth(trial, ROBOTS["panda"].joint_names).shape == (T, 7)
     with pytest.raises(UserError, match="no motion for the joints elbow; it has no recorded robot"):
         robot_truth(trial, ("elbow",))
     with pytest.raises(UserError, match="no motion for the joints panda_joint1"):
-        robot_truth(replace(trial, partner_arm=None), PANDA_JOINTS)
+        robot_truth(replace(trial, partner_arm=None), ROBOTS["panda"].joint_names)

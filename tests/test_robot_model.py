@@ -18,7 +18,7 @@ from mild_viz.robot import chain as chain_module
 from mild_viz.robot.chain import load_chain
 from mild_viz.robot.ik import forward, jacobian
 from mild_viz.robot.model import RobotModel, load_robot
-from mild_viz.robot.robots import PEPPER_JOINTS, PEPPER_REST
+from mild_viz.robot.robots import ROBOTS
 from mild_viz.robot.visuals import resolve_file
 from mild_viz.trial import ACTIONS
 
@@ -89,10 +89,10 @@ def test_link_poses_agree_with_yourdfpy(shared, relative):
     assert poses.shape == (5, len(robot.link_names), 7)
     np.testing.assert_allclose(np.linalg.norm(poses[..., :4], axis=-1), 1.0, atol=1e-12)
     oracle = yourdfpy.URDF.load(str(robot.urdf), load_meshes=False)
-    rest = robot.description.values(PEPPER_REST)
+    rest = robot.description.values(dict(ROBOTS["pepper"].rest))
     for k in range(len(joints)):
         values = {name: rest[name] for name in oracle.actuated_joint_names}
-        oracle.update_cfg(values | dict(zip(PEPPER_JOINTS, joints[k], strict=True)))
+        oracle.update_cfg(values | dict(zip(ROBOTS["pepper"].joint_names, joints[k], strict=True)))
         for name, pose in zip(robot.link_names, poses[k], strict=True):
             expected = oracle.get_transform(name, robot.description.root)
             np.testing.assert_allclose(pose[4:], expected[:3, 3], atol=1e-12)
@@ -109,9 +109,9 @@ def test_fold_agrees_with_pytorch_kinematics(shared, relative, cache):
     joints = random_joints(robot, 1000)
     oracle = pk.build_serial_chain_from_urdf(robot.urdf.read_bytes(), "r_gripper").to(dtype=torch.float64)
     names = oracle.get_joint_parameter_names()
-    rest = robot.description.values(PEPPER_REST)
+    rest = robot.description.values(dict(ROBOTS["pepper"].rest))
     full = np.tile([rest[name] for name in names], (len(joints), 1))
-    full[:, [names.index(name) for name in PEPPER_JOINTS]] = joints
+    full[:, [names.index(name) for name in ROBOTS["pepper"].joint_names]] = joints
     pose: Any = oracle.forward_kinematics(torch.from_numpy(full))
     expected = pose.get_matrix()[:, :3, 3].numpy()
     np.testing.assert_allclose(robot.end_effector(joints), expected, atol=1e-7)
@@ -151,7 +151,8 @@ def test_jacobian_equals_finite_differences():
 
 def test_links_that_do_not_move_keep_their_pose():
     robot = load_robot("pepper")
-    poses = robot.link_poses(random_joints(robot, 20))
+    left = np.random.default_rng(3).uniform(robot.arms["left"].lower, robot.arms["left"].upper, (20, 4))
+    poses = robot.link_poses(random_joints(robot, 20), others={"left": left})
     for column, name in enumerate(robot.link_names):
         spread = np.abs(poses[:, column] - poses[0, column]).max()
         assert (spread > 1e-3) == (name in robot.moving_links), name
@@ -169,7 +170,12 @@ def test_hand_of_an_action_turns_without_moving_the_end_effector(shared):
                 changed = np.abs(poses[:, column] - plain[link]).max() > 1e-9
                 # the forearm and everything else stay; every action has a wrist or fingers of its own
                 assert not changed or hand, (action, link)
-            chain = load_chain(robot.description, PEPPER_JOINTS, "r_gripper", robot.rest | robot.hands[action])
+            chain = load_chain(
+                robot.description,
+                ROBOTS["pepper"].joint_names,
+                "r_gripper",
+                {**robot.spec.rest, **robot.spec.hands[action]},
+            )
             np.testing.assert_allclose(forward(chain, joints), robot.end_effector(joints), atol=1e-9)
 
 
@@ -315,7 +321,7 @@ def test_package_paths(small_arm):
 
 
 def test_unknown_robot_and_missing_file(tmp_path):
-    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, panda, yumi, or the path"):
+    with pytest.raises(UserError, match="robot 'peper' is unknown; valid: pepper, kobo, panda, yumi, a folder"):
         load_robot("peper")
     with pytest.raises(UserError, match="nothing.urdf is not a file"):
         load_robot(str(tmp_path / "nothing.urdf"))

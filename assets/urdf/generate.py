@@ -12,7 +12,7 @@ from pathlib import Path
 from modelling.description import ply, urdf
 
 HERE = Path(__file__).resolve().parent
-ROBOTS = ("pepper", "panda", "yumi")
+ROBOTS = ("pepper", "panda", "yumi", "kobo")
 
 
 def write(robot: str, out: Path) -> None:

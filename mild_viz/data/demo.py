@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from mild_viz.data.demo_body import DEMO_BONES, DEMO_JOINTS, Person, body_joints, make_person
 from mild_viz.data.demo_motion import RATE, Script, write_script
-from mild_viz.data.skeletons import joint_indices, person_frame, to_frame, to_world
-from mild_viz.trial import ARM_POINTS, Dataset, Skeleton, Trial
+from mild_viz.data.skeletons import ARM_JOINTS, joint_indices, person_frame, to_frame, to_world
+from mild_viz.trial import Dataset, Skeleton, Trial
 
 VERSION = 1
 """Raise it with every change that alters a number: the data's checksum is taken from it and the seed."""
@@ -138,7 +138,7 @@ def make_demo(seed: int = 0) -> Dataset:
     return until it hangs again, rest. In a wave, contact is the waving proper: from the first swing to the last.
     """
     splits: dict[str, list[Trial]] = {"train": [], "test": []}
-    arm = joint_indices(DEMO_JOINTS, ARM_POINTS)
+    arm = joint_indices(DEMO_JOINTS, ARM_JOINTS)
     for split, trials in splits.items():
         for index, take in enumerate(make_takes(seed, split)):
             rng = np.random.default_rng([seed, VERSION, len(split), index])

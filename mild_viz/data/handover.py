@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from mild_viz.data.checks import file_checksum
 from mild_viz.data.npz import load_npz
-from mild_viz.data.skeletons import ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
-from mild_viz.trial import ARM_POINTS, HAND_POINTS, Dataset, Skeleton, Trial
+from mild_viz.trial import HAND_POINTS, Dataset, Skeleton, Trial
 
 FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
 ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
@@ -69,7 +69,7 @@ def read_file(path: Path, split: str) -> list[Trial]:
             T_world_partner, partner = _own_frame(giver[first:last])
         except UserError as error:
             raise UserError(f"{path}: {split} trial {index}: {error}") from error
-        arm = joint_indices(ZED_JOINTS, ARM_POINTS)
+        arm = joint_indices(ZED_JOINTS, ARM_JOINTS)
         trials.append(
             Trial(
                 dataset="handover",

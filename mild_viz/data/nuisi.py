@@ -10,9 +10,9 @@ import numpy as np
 from mild_viz.data import nuitrack
 from mild_viz.data.checks import LABELS, TRAJECTORY_ARRAYS, check_trial_array, file_checksum, paired
 from mild_viz.data.npz import load_npz
-from mild_viz.data.skeletons import NUITRACK_JOINTS, joint_indices
+from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, joint_indices
 from mild_viz.errors import UserError
-from mild_viz.trial import ARM_POINTS, Dataset, Skeleton, Trial
+from mild_viz.trial import Dataset, Skeleton, Trial
 
 RATE = 30.0
 FILE = Path("nuisi/traj_data.npz")
@@ -80,7 +80,7 @@ def _attach_bodies(path: Path, person: str, train: list[Trial], test: list[Trial
     body_of: dict[str, Skeleton] = {}
     for trial, body in zip(rockets, bodies, strict=True):
         arm = trial.human_arm if person == "human" else trial.partner_arm
-        raw_arm = body.positions[:, joint_indices(NUITRACK_JOINTS, ARM_POINTS)]
+        raw_arm = body.positions[:, joint_indices(NUITRACK_JOINTS, ARM_JOINTS)]
         if arm is None or not _agree(arm, raw_arm):
             raise UserError(f"{path} does not belong to {trial.name}: its {person}'s arm differs from the trial's")
         body_of[trial.name] = body

@@ -6,6 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.errors import UserError
+from mild_viz.trial import ARM_POINTS
+
+ARM_JOINTS = ARM_POINTS
+"""The joints of `Trial.human_arm`, in its order, which every body model here has."""
 
 NUITRACK_JOINTS = (
     "head", "neck", "torso", "waist",

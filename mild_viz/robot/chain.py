@@ -42,6 +42,8 @@ class ArmChain:
     end_effector: str
     lower: Float[np.ndarray, " J"]
     upper: Float[np.ndarray, " J"]
+    velocity: Float[np.ndarray, " J"]
+    """Largest speed of each joint [rad/s]; infinite where the description states none."""
     rest: Float[np.ndarray, " J"]
     """Where the joints stand when nothing moves them [rad]."""
     offsets: Float[np.ndarray, "_ 4 4"]
@@ -101,9 +103,15 @@ def kernel_array(values: np.ndarray) -> np.ndarray:
 
 
 def load_chain(
-    description: Description, joint_names: tuple[str, ...], end_effector: str, rest: dict[str, float]
+    description: Description,
+    joint_names: tuple[str, ...],
+    end_effector: str,
+    rest: dict[str, float],
+    tip_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ArmChain:
-    """The chain of `joint_names` up to `end_effector`; joints in between that are not named rest.
+    """The chain of `joint_names` up to `end_effector`, moved by `tip_offset` [m] in its own frame.
+
+    Joints in between that are not named rest.
 
     Raises `UserError` where a joint or the end effector is missing, where a joint does not turn or states no
     limits, where it is not between the base and the end effector in the given order, or where a joint of several
@@ -134,9 +142,13 @@ def load_chain(
         )
     values = description.values(rest)
     offsets, axes = _cached_fold(description, joint_names, end_effector, values)
+    tip = np.eye(4)
+    tip[:3, 3] = tip_offset
+    offsets = np.concatenate([offsets[:-1], [offsets[-1] @ tip]])
     lower, upper = np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+    velocity = np.array([joint.velocity for joint in joints])
     resting = np.array([values[name] for name in joint_names])
-    return ArmChain(tuple(joint_names), end_effector, lower, upper, resting, offsets, axes)
+    return ArmChain(tuple(joint_names), end_effector, lower, upper, velocity, resting, offsets, axes)
 
 
 def cache_folder() -> Path:

@@ -55,6 +55,8 @@ class Joint:
     lower: float
     """Infinite where the file states no limit [rad or m]."""
     upper: float
+    velocity: float
+    """Largest speed [rad/s or m/s]; infinite where the file states none."""
     mimic: tuple[str, float, float] | None
     """(joint, multiplier, offset) where this joint follows another one."""
 
@@ -220,11 +222,14 @@ def _convert(joint: yourdfpy.Joint) -> Joint:
         upper = upper if joint.limit.upper is None else float(joint.limit.upper)
         if not lower <= upper:
             raise ValueError(f"joint {joint.name} has the limits {lower} to {upper}")
+    velocity = np.inf
+    if joint.limit is not None and joint.limit.velocity:  # 0 stands for "not stated" in many files
+        velocity = abs(float(joint.limit.velocity))
     mimic = None
     if joint.mimic is not None:
         multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
         mimic = (joint.mimic.joint or "", multiplier, float(joint.mimic.offset or 0.0))
-    return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, mimic)
+    return Joint(joint.name, joint.type, joint.parent, joint.child, origin, axis, lower, upper, velocity, mimic)
 
 
 def _sort(path: Path, links: list[str], joints: list[Joint]) -> tuple[str, tuple[Joint, ...]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,28 +13,41 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain, load_chain
-from mild_viz.robot.description import Description, read_description
+from mild_viz.robot.description import TURNING, Description, read_description
 from mild_viz.robot.ik import forward
 from mild_viz.robot.kinematics.tree import LinkTree, build_tree
-from mild_viz.robot.robots import ROBOTS, find_urdf
+from mild_viz.robot.robots import find_robot
+from mild_viz.robot.spec import ArmSpec, RobotSpec
 from mild_viz.robot.visuals import drawn_links, load_visuals
 
 if TYPE_CHECKING:
     import trimesh
 
+MOVING = (*TURNING, "prismatic")
+"""Joint types that a robot.toml may give a value to."""
+
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A robot whose J joints of one arm are controlled; all other joints rest."""
+    """A robot of which the joints of one arm or more are controlled; all other joints rest."""
 
     name: str
-    chain: ArmChain
+    spec: RobotSpec
+    arms: Mapping[str, ArmChain]
+    """The arms that can be controlled, by name; the first one interacts, and drives what `chain` says."""
     tree: LinkTree
-    rest: dict[str, float]
-    """Where the joints rest [rad]; those not named at 0."""
-    hands: dict[str, dict[str, float]]
-    """Where the joints of the hand stand instead during each action [rad]."""
+    """Moves with the joints of all arms, one arm after the other."""
     description: Description
+
+    @cached_property
+    def chain(self) -> ArmChain:
+        """The arm that interacts, of J joints."""
+        return next(iter(self.arms.values()))
+
+    @property
+    def title(self) -> str:
+        """The robot's name as its maker writes it."""
+        return self.spec.title
 
     @property
     def urdf(self) -> Path:
@@ -59,7 +73,7 @@ class RobotModel:
         """Height of the floor that the resting robot stands on, in the base frame [m]."""
         footprint = [joint.child for joint in self.description.joints if joint.child == "base_footprint"]
         if footprint:
-            values = self.description.values(self.rest)
+            values = self.description.values(dict(self.spec.rest))
             pose = np.eye(4)
             for joint in self.description.path_to(footprint[0]):
                 pose = pose @ joint.motion(values[joint.name])
@@ -67,20 +81,33 @@ class RobotModel:
         poses = dict(zip(self.link_names, self.tree.resting, strict=True))
         return min((_lowest(mesh, poses[name]) for name, mesh in self.visuals.items()), default=0.0)
 
-    def link_poses(self, joints: Float[np.ndarray, "N J"], action: str | None = None) -> Float[np.ndarray, "N L 7"]:
-        """Pose of every drawn link in the base frame (wxyz, xyz [m]) at N joint vectors [rad].
+    def link_poses(
+        self,
+        joints: Float[np.ndarray, "N J"],
+        action: str | None = None,
+        others: Mapping[str, Float[np.ndarray, "N _"]] | None = None,
+    ) -> Float[np.ndarray, "N L 7"]:
+        """Pose of every drawn link in the base frame (wxyz, xyz [m]) at N joint vectors [rad] of the first arm.
 
-        With an action, the hand has the posture of that action; the end effector is where it is without.
+        The other arms rest, unless `others` has their joints. With an action, the hand has the posture of that
+        action; the end effector is where it is without.
         """
         self._check(joints)
         tree = self.tree if action is None else self._trees.get(action, self.tree)
-        return tree.poses(joints)
+        if len(self.arms) == 1:
+            return tree.poses(joints)
+        names = list(self.arms)[1:]
+        unknown = sorted(set(others or ()) - set(names))
+        if unknown:
+            raise UserError(f"robot {self.name} has no other arm '{unknown[0]}'; valid: {', '.join(names)}")
+        rows = [(others or {}).get(name, np.tile(self.arms[name].rest, (len(joints), 1))) for name in names]
+        return tree.poses(np.concatenate([joints, *rows], axis=1))
 
     @cached_property
     def _trees(self) -> dict[str, LinkTree]:
         return {
-            action: build_tree(self.description, self.chain.joint_names, self.rest | hand, self.link_names)
-            for action, hand in self.hands.items()
+            action: build_tree(self.description, _all_joints(self.arms), {**self.spec.rest, **hand}, self.link_names)
+            for action, hand in self.spec.hands.items()
         }
 
     def end_effector(self, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N 3"]:
@@ -104,15 +131,43 @@ def _lowest(mesh: trimesh.Trimesh, pose: Float[np.ndarray, "7"]) -> float:
 def load_robot(
     name_or_path: str, joint_names: tuple[str, ...] | None = None, end_effector: str | None = None
 ) -> RobotModel:
-    """A robot by its name in `ROBOTS` or by the path of its URDF.
+    """A robot by its name in `ROBOTS`, its folder (with a robot.toml), or the path of its URDF.
 
-    Joints and end effector default to those of the known robot, else to Pepper's right arm. Raises
-    `UserError` where the description is missing or broken, or lacks them (listing what it has).
+    Joints and end effector of the interacting arm default to those of the robot's first arm, else to Pepper's right
+    one. Raises `UserError` where the description is missing or broken, or lacks them (listing what it has).
     """
-    name, path = find_urdf(name_or_path)
-    known = ROBOTS.get(name_or_path, ROBOTS["pepper"])
-    joint_names = known.joint_names if joint_names is None else tuple(joint_names)
-    description = read_description(path)
-    chain = load_chain(description, joint_names, end_effector or known.end_effector, known.rest)
-    tree = build_tree(description, joint_names, known.rest, drawn_links(description))
-    return RobotModel(name, chain, tree, known.rest, known.hands, description)
+    spec = find_robot(name_or_path)
+    description = read_description(spec.urdf)
+    _check_values(spec, description)
+    arms = {arm.name: arm for arm in _interacting_first(spec, joint_names, end_effector)}
+    chains = {
+        name: load_chain(description, arm.joints, arm.end_effector, dict(spec.rest), arm.tip_offset)
+        for name, arm in arms.items()
+    }
+    tree = build_tree(description, _all_joints(chains), dict(spec.rest), drawn_links(description))
+    return RobotModel(spec.name, replace(spec, arms=arms), chains, tree, description)
+
+
+def _interacting_first(spec: RobotSpec, joint_names: tuple[str, ...] | None, end_effector: str | None) -> list[ArmSpec]:
+    """The robot's arms, first the one of these joints; an arm that the robot does not know takes the first's place."""
+    arms = list(spec.arms.values())
+    joint_names = arms[0].joints if joint_names is None else tuple(joint_names)
+    known = next((arm for arm in arms if arm.joints == joint_names), None)
+    first = known or ArmSpec(arms[0].name, joint_names, arms[0].end_effector, arms[0].tip_offset)
+    if end_effector is not None and end_effector != first.end_effector:
+        first = replace(first, end_effector=end_effector, tip_offset=(0.0, 0.0, 0.0))
+    # an arm that shares a joint with it would be controlled twice
+    return [first] + [arm for arm in arms if arm.name != first.name and not set(arm.joints) & set(first.joints)]
+
+
+def _check_values(spec: RobotSpec, description: Description) -> None:
+    """`UserError` where a robot.toml gives a value to a joint that its description does not have."""
+    have = [joint.name for joint in description.joints if joint.kind in MOVING and joint.mimic is None]
+    for where, values in (("rest", spec.rest), *((f"hands.{action}", hand) for action, hand in spec.hands.items())):
+        unknown = [name for name in values if name not in have]
+        if spec.file is not None and unknown:
+            raise UserError(f"{spec.file}: {where}: there is no joint '{unknown[0]}'; valid: {', '.join(have)}")
+
+
+def _all_joints(arms: Mapping[str, ArmChain]) -> tuple[str, ...]:
+    return tuple(name for chain in arms.values() for name in chain.joint_names)

@@ -13,7 +13,8 @@ from typing import Any, get_type_hints
 from mild_viz.data.load import check_name
 from mild_viz.errors import UserError
 from mild_viz.settings import VARIANTS, choose
-from mild_viz.training.config import OPTIONS, check_keys, converted, make_options, read_toml
+from mild_viz.toml_config import check_keys, converted, read_toml
+from mild_viz.training.config import OPTIONS, make_options
 from mild_viz.training.options import TrainingOptions, stage_variants
 
 READABLE = 100

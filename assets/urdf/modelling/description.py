@@ -52,7 +52,10 @@ def ply(pieces: list[Piece]) -> bytes:
 
 
 def urdf(name: str, root: str, joints: Sequence[Joint], meshes: Mapping[str, str]) -> str:
-    """The text of the description of robot `name`; a link not in `meshes` is only a frame."""
+    """The text of the description of robot `name`; a link not in `meshes` is only a frame.
+
+    `meshes` names a mesh of the robot's own folder, or the file of another robot's relative to this one's.
+    """
     lines = [
         '<?xml version="1.0"?>',
         "<!-- Written by generate.py; edit that. Sources of the numbers: README.md. -->",
@@ -62,11 +65,12 @@ def urdf(name: str, root: str, joints: Sequence[Joint], meshes: Mapping[str, str
         if link not in meshes:
             lines.append(f'  <link name="{link}"/>')
             continue
+        mesh = meshes[link]
         lines += [
             f'  <link name="{link}">',
             f'    <visual name="{link}_visual">',
             "      <geometry>",
-            f'        <mesh filename="meshes/{meshes[link]}.ply"/>',
+            f'        <mesh filename="{mesh if "/" in mesh else f"meshes/{mesh}.ply"}"/>',
             "      </geometry>",
             "    </visual>",
             "  </link>",

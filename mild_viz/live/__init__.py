@@ -1,0 +1,1 @@
+"""Live operation: skeleton frames in, joint commands out."""
