@@ -31,6 +31,12 @@ def test_late_and_repeated_frames_are_not_used(numbered: bool) -> None:
     assert verdicts(*frames) == expected
 
 
+@pytest.mark.parametrize("numbered", [True, False])
+def test_several_late_frames_in_their_own_order_are_no_restart(numbered: bool) -> None:
+    frames = [seen(number if numbered else None, number / RATE) for number in (0, 1, 20, 2, 3, 4, 5, 21)]
+    assert verdicts(*frames) == ["new"] * 3 + ["reordered"] * 4 + ["new"]
+
+
 def test_numbers_decide_where_the_clock_is_coarse_or_set_back() -> None:
     frames = [seen(1, 5.0), seen(2, 5.0), seen(3, 5.0), seen(4, -100.0), seen(5, -99.9), seen(6, 1e9)]
     assert verdicts(*frames) == ["new"] * 6

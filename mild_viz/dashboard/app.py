@@ -22,6 +22,7 @@ from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
 from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
+from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import ControlSettings, InferSettings, choose
@@ -70,16 +71,24 @@ class Dashboard:
     def _show(self, rollout: Rollout, choice: Choice, is_new: bool) -> None:
         """Called by the session's worker with every new rollout or view."""
         self._set_theme(choice.view.dark)
-        self.scene.show(rollout, choice.view)
+        compared = self._compare(rollout, choice)
+        self.scene.show(rollout, choice.view, compared)
         before = self.session.choice
         restart = before is None or before.trial is not choice.trial
-        self.controls.show(rollout, choice)
+        control, chain = choice.settings.control, self.robot.chain
+        figures = [controller_figures(one, chain, control.lambda_x, control.lambda_q) for one in compared]
+        self.controls.show(rollout, choice, figures)
         self.timeline.show(rollout, choice.view.alpha_mode)
         # Last: the player then draws this frame and lets the texts follow, on its own thread.
         self.player.load(rollout.inference.n_windows, rollout.inference.rate, restart)
         if before is None:
             # Reading all datasets may take seconds: the page stands already, and the list completes itself.
             threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()
+
+    def _compare(self, rollout: Rollout, choice: Choice) -> tuple[Rollout, ...]:
+        """The rollouts of the compared controllers; a few milliseconds each, in the session's worker."""
+        compared, settings = choice.view.compared, choice.settings.control
+        return run_controllers(rollout.inference, choice.checkpoint, self.robot, choice.trial, settings, compared)
 
     def _tick(self, frame: int, playing: bool) -> None:
         self.timeline.tick(frame, playing)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -13,6 +14,7 @@ from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
+from mild_viz.dashboard.tabs.compare import CompareFolder
 from mild_viz.dashboard.tabs.record import RecordTab, Writer
 from mild_viz.dashboard.tabs.robot import RobotTab
 from mild_viz.dashboard.tabs.states import StatesTab
@@ -20,6 +22,7 @@ from mild_viz.dashboard.tabs.trial import TrialTab
 from mild_viz.dashboard.tabs.view import ViewTab
 from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
+from mild_viz.evaluation.controllers import ControllerFigures
 from mild_viz.rollout import Rollout
 from mild_viz.settings import InferSettings, Settings
 from mild_viz.trial import CONTACT_ACTIONS
@@ -54,6 +57,7 @@ class Controls:
             self._trial = TrialTab(gui, catalog, first, model, changed)
         with tabs.add_tab("Robot"):
             self._robot = RobotTab(gui, changed)
+            self._compare = CompareFolder(gui, changed)
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
             self._states.save.on_click(lambda _event: self._save_contact_states())
@@ -67,10 +71,12 @@ class Controls:
         infer, checkpoint, trial = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, contact_states)
-        return Choice(Settings(infer, control), self._view.read(), checkpoint, trial)
+        view = replace(self._view.read(), compared=self._compare.read())
+        return Choice(Settings(infer, control), view, checkpoint, trial)
 
-    def show(self, rollout: Rollout, choice: Choice) -> None:
-        """Follow a new rollout."""
+    def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:
+        """Follow a new rollout, and the figures of the controllers that are compared on its trial."""
+        self._compare.show(compared)
         self._rollout, self._choice = rollout, choice
         self._view.show(rollout)
         self._trial.show(rollout)

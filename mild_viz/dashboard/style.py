@@ -138,6 +138,12 @@ PANEL_CSS = """
 .mv-note {
   padding: 2px 12px 8px; font-size: 12px; line-height: 1.4; color: var(--mantine-color-dimmed); overflow-wrap: anywhere;
 }
+.mv-table { margin: 0 12px 6px; width: calc(100% - 24px); border-collapse: collapse; font-size: 12px; line-height: 1.3;
+  font-variant-numeric: tabular-nums; color: var(--mantine-color-text); }
+.mv-table th { font-weight: 500; text-align: right; vertical-align: bottom; padding: 2px 0 2px 6px; }
+.mv-table tr > th:first-child { text-align: left; white-space: nowrap; padding-left: 0; }
+.mv-table td { text-align: right; padding: 2px 0 2px 6px; border-top: 1px solid var(--mantine-color-default-border); }
+.mv-table tr + tr th { border-top: 1px solid var(--mantine-color-default-border); }
 .mv-note b { color: var(--mantine-color-text); }
 .mv-note code { font-size: 11px; }
 .mv-error { margin: 0 12px 14px; padding: 8px 10px; font-size: 12px; line-height: 1.4; border-radius: 4px;

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mild_viz.errors import UserError
-from mild_viz.settings import ALPHA_MODES, choose
+from mild_viz.settings import ALPHA_MODES, CONTROLLERS, choose
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,10 @@ class ViewSettings:
     mass, two hold 45 %: with the smaller, the current point would mostly lie outside its state."""
     ghost: bool = True
     """Draw the decoded motion, before inverse kinematics, as a translucent arm."""
+    show_reach: bool = False
+    """Draw where the robot's hand can be."""
+    compared: tuple[str, ...] = ()
+    """Controllers that are run too, and drawn as ghosts beside the commanded arm."""
     show_human: bool = True
     show_robot: bool = True
     show_latent: bool = True
@@ -28,6 +32,8 @@ class ViewSettings:
 
     def __post_init__(self) -> None:
         choose("alpha mode", self.alpha_mode, ALPHA_MODES)
+        for name in self.compared:
+            choose("compared controller", name, CONTROLLERS)
         if not 0.0 < self.sigma < float("inf"):
             raise UserError(f"sigma is {self.sigma}; valid: a finite number above 0")
         axes = self.latent_axes

@@ -100,6 +100,12 @@ DARK = Palette(
 )
 
 
+CONTROLLER_COLORS: dict[str, Rgb] = {
+    "base-ik": rgb("#E69F00"), "mild": rgb("#8250C8"), "mild-ik": rgb("#009E73"),
+}  # fmt: skip
+"""Colour of each controller's ghost where several are compared, on either background."""
+
+
 def palette(dark: bool) -> Palette:
     """The colours that read on the page's light or dark background."""
     return DARK if dark else LIGHT

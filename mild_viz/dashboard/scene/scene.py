@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
 from mild_viz.dashboard.scene import body
+from mild_viz.dashboard.scene.compared import ComparedView
 from mild_viz.dashboard.scene.figure import Figure, make_figure
 from mild_viz.dashboard.scene.ground import GroundView
 from mild_viz.dashboard.scene.human import HumanView
@@ -17,6 +19,7 @@ from mild_viz.dashboard.scene.layout import CAMERAS, WIDEST, Camera, Layout, cam
 from mild_viz.dashboard.scene.palette import palette
 from mild_viz.dashboard.scene.reach import ReachView
 from mild_viz.dashboard.scene.robot import RobotView, robot_frames
+from mild_viz.dashboard.scene.volume import VolumeView
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
@@ -41,6 +44,8 @@ class Scene:
         colors = palette(dark)
         self._human = HumanView(server, colors)
         self._robot = RobotView(server, robot.visuals, tuple(robot.link_names), robot.name)
+        self._compared = ComparedView(server, robot.visuals, robot.link_names)
+        self._volume = VolumeView(server, robot.chain)
         self._latent = LatentView(server, colors)
         self._reach = ReachView(server)
 
@@ -49,8 +54,8 @@ class Scene:
         """Where the groups of the rollout stand; None before the first `show`."""
         return self._layout
 
-    def show(self, rollout: Rollout, view: ViewSettings) -> None:
-        """Take over a rollout and a view, and stay at the frame that was shown.
+    def show(self, rollout: Rollout, view: ViewSettings, compared: Sequence[Rollout] = ()) -> None:
+        """Take over a rollout and a view, and stay at the frame that was shown; `compared` are drawn as ghosts.
 
         What the new rollout shares with the last one is not computed again: a control-only rerun keeps the
         figure and the latent plot.
@@ -72,7 +77,10 @@ class Scene:
                 fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
             self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human, inference.tracked)
-            self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, view.ghost)
+            ghost = view.ghost and not compared  # of too many arms none can be told apart
+            self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, ghost)
+            self._compared.show([one for one in compared if one.controller != rollout.controller], view.show_robot)
+            self._volume.show(colors, view.show_reach and view.show_robot)
             self._reach.show(rollout, colors, view.show_human and view.show_robot)
             self._latent.show(frames, layout, colors, view.show_latent)
             self._figure, self._latent_frames = figure, frames
@@ -119,6 +127,7 @@ class Scene:
         self._frame = n
         self._human.set_frame(n)
         self._robot.set_frame(n)
+        self._compared.set_frame(n)
         self._reach.set_frame(n)
         self._latent.set_frame(n)
 

@@ -49,13 +49,16 @@ class ViewTab:
         self._ghost = gui.add_checkbox(
             "Ghost", default.ghost, hint="Also draw the decoded motion, before inverse kinematics, translucent."
         )
+        self._reach = gui.add_checkbox(
+            "Reach volume", default.show_reach, hint="Draw how far the robot's hand reaches in every direction."
+        )
         self._visible = {
             group: gui.add_checkbox(f"Show {group}", True, hint=f"Draw the {group}.")
             for group in ("human", "robot", "latent plot")
         }
         self._axis_names = ["z0", "z1", "z2"]
         """What the axes were at the last reading."""
-        widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost)
+        widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost, self._reach)
         for handle in (*widgets, *self._visible.values()):
             on_person(handle, changed)
 
@@ -85,6 +88,7 @@ class ViewTab:
             latent_axes=(x, y, z) if by_dimension else "pca",
             sigma=number(self._sigma),
             ghost=bool(self._ghost.value),
+            show_reach=bool(self._reach.value),
             show_human=human,
             show_robot=robot,
             show_latent=latent,
