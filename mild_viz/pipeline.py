@@ -13,19 +13,20 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
-from mild_viz.decoding import decoding_of, open_robot, points_of
+from mild_viz.decoding import decoding_of, hand_map_of, open_robot, points_of
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
+from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import in_frame
-from mild_viz.robot.controller import initial_carry, run_controller
+from mild_viz.robot.controller import ControlResult, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import WINDOW, ControlSettings
+from mild_viz.settings import CONTROLLERS_OF, WINDOW, ControlSettings, choose
 from mild_viz.trial import WRIST, Skeleton, Trial
 
 NEWEST = WINDOW - 1
@@ -92,8 +93,10 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         human_hand=points[newest, checkpoint.points.index(WRIST)],
         human_skeleton=_rows_of(trial.human_skeleton, newest),
         phase=None if trial.phase is None else trial.phase[newest],
-        decodes=decoding.decodes,
+        decodes=checkpoint.decodes,
         partner_decoded=moved.partner,
+        others_decoded=moved.others,
+        others_truth={arm: joints[first] for arm, joints in truth.others.items()},
         partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
     )
 
@@ -111,21 +114,32 @@ def joint_log_alpha(
 def control(
     inference: Inference, checkpoint: Checkpoint, robot: RobotModel, trial: Trial, settings: ControlSettings
 ) -> Rollout:
-    """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
+    """The commands that a controller makes of an inference, and where everything stands: world is the robot's base.
+
+    Raises:
+        UserError: for a controller that does not go with what the model decodes, or contact states that do not exist.
+    """
+    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[inference.decodes])
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
     transition = checkpoint.transition_state_of(inference.variant, inference.action)
-    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement_for(robot.chain))
+    stored, follow = checkpoint.placement_for(robot.chain), hand_map_of(checkpoint, robot)
+    placed = place_human(robot.chain, trial, settings.placement, stored, follow)
     target = in_frame(placed.T_world_human, inference.human_hand)
-    result = run_controller(
-        robot.chain,
-        settings,
-        inference.action,
-        inference.log_alpha_human,
-        inference.joints_decoded,
-        target,
-        initial_carry(robot.chain),
-        inference.log_transition if uses_transition(settings, transition) else None,
-    )
+
+    def run(chain: ArmChain, decoded: np.ndarray) -> ControlResult:
+        return run_controller(
+            chain,
+            settings,
+            inference.action,
+            inference.log_alpha_human,
+            decoded,
+            target,
+            initial_carry(chain),
+            inference.log_transition if uses_transition(settings, transition) else None,
+        )
+
+    result = run(robot.chain, inference.joints_decoded)
+    others = {arm: run(robot.arms[arm], decoded).joints for arm, decoded in inference.others_decoded.items()}
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
@@ -133,6 +147,7 @@ def control(
         controller=settings.controller,
         robot=robot.name,
         joints_commanded=result.joints,
+        others_commanded=others,
         end_effector=end_effector,
         end_effector_decoded=robot.end_effector(inference.joints_decoded),
         target=target,
@@ -141,8 +156,8 @@ def control(
         stiffness=result.stiffness,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
-        link_poses=robot.link_poses(result.joints, inference.action),
-        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action),
+        link_poses=robot.link_poses(result.joints, inference.action, others),
+        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action, inference.others_decoded),
         state_durations=durations,
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),

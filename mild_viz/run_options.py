@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
-ControllerName = Literal["base-ik", "mild", "mild-ik"]
+ControllerName = Literal["base-ik", "mild", "mild-ik", "task-space"]
 SplitName = Literal["train", "test"]
 
 # Options whose default depends on others: their text says what it is, so that no "{None}" and "default: None" is shown.
@@ -30,6 +30,9 @@ OptionalNames = Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME [N
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
     VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
+]
+OptionalController = Annotated[
+    ControllerName | None, tyro.conf.arg(metavar="{base-ik,mild,mild-ik,task-space}", help_behavior_hint="")
 ]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]
@@ -71,13 +74,14 @@ class RunOptions:
 
     Attributes:
         checkpoint: Folder of a trained model. Default: the shipped model of the dataset.
-        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
+        dataset: Recordings: demo, nuisi, yumi, handover, handover-hands, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
         variant: Variant of MILD. Default: v3.1, or the first one of a model without it. Example: --variant v2.1
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
-            model). Example: --controller mild
+            model); for a model of two hands task-space (inverse kinematics of both arms to the decoded hands).
+            Default: mild-ik, or task-space. Example: --controller mild
         contact_states: States of the HMM in which the partners touch. Default: the model's own, as saved from
             the dashboard. Example: --contact-states 2 3
         lambda_x: Weight of reaching the hand [1/m^2], 0 or more. Example: --lambda-x 2
@@ -98,7 +102,7 @@ class RunOptions:
     split: SplitName = "test"
     trial: int = 0
     variant: OptionalVariant = None
-    controller: ControllerName = "mild-ik"
+    controller: OptionalController = None
     contact_states: OptionalStates = None
     lambda_x: float = 1.0
     lambda_q: float = 0.01
@@ -113,12 +117,12 @@ class RunOptions:
         from mild_viz.data.load import load_dataset
         from mild_viz.decoding import open_robot
         from mild_viz.pipeline import control, infer
-        from mild_viz.settings import ControlSettings, Placement
+        from mild_viz.settings import CONTROLLERS_OF, ControlSettings, Placement
 
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
         checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
         settings = ControlSettings(
-            controller=self.controller,
+            controller=self.controller or CONTROLLERS_OF[checkpoint.decodes][0],
             lambda_x=self.lambda_x,
             lambda_q=self.lambda_q,
             contact_states=None if self.contact_states is None else frozenset(self.contact_states),

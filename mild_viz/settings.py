@@ -57,7 +57,16 @@ MAX_PLACEMENT = 100
 """A human stands nearer than this to the robot, in each direction [m]."""
 
 ALPHA_MODES = ("human", "joint", "unobserved")
-CONTROLLERS = ("base-ik", "mild", "mild-ik")
+CONTROLLERS = ("base-ik", "mild", "mild-ik", "task-space")
+"""What makes a command: inverse kinematics to the human's hand, the decoded joints, those adapted by inverse kinematics
+in contact, or inverse kinematics of all arms to the decoded hands."""
+
+CONTROLLERS_OF = {
+    "joints": ("mild-ik", "mild", "base-ik"),
+    "arm": ("mild-ik", "mild", "base-ik"),
+    "hands": ("task-space",),
+}
+"""Those that a model can have, by what it decodes of the partner (`Checkpoint.decodes`); the first is the default."""
 
 
 def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:

@@ -5,6 +5,7 @@ Fed with the frames of a trial it gives the numbers of `pipeline.infer` and `pip
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,8 +18,9 @@ from mild_viz.decoding import Decoding, decoding_of
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
 from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.prediction import advance
+from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import in_frame
-from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller
+from mild_viz.robot.controller import ControlCarry, ControlResult, initial_carry, run_controller
 from mild_viz.robot.model import RobotModel
 from mild_viz.settings import POINT_FEATURES, WINDOW, ControlSettings, choose
 from mild_viz.trial import WRIST
@@ -60,6 +62,8 @@ class Carry(NamedTuple):
     decoding: Float[np.ndarray, " J"]
     """The last decoded joints."""
     control: ControlCarry
+    others: Mapping[str, ControlCarry]
+    """Those of the robot's other arms that move, by name."""
 
 
 class Command(NamedTuple):
@@ -75,6 +79,9 @@ class Command(NamedTuple):
     target: Float[np.ndarray, " 3"]
     contact: bool
     stiffness: Float[np.ndarray, " J"]
+    others_decoded: Mapping[str, Float[np.ndarray, "_"]]
+    """The decoded joints of the robot's other arms that move, by name."""
+    others_commanded: Mapping[str, Float[np.ndarray, "_"]]
 
 
 def stream_model(
@@ -108,7 +115,7 @@ def start(model: StreamModel) -> Carry:
     """The state before the first observation."""
     empty = np.full((WINDOW, POINT_FEATURES * len(model.points)), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain))
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain), {})
 
 
 def step(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> tuple[Carry, Command | None]:
@@ -123,26 +130,41 @@ def step(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> 
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
-    decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
+    moved = model.decoding.move(said.decoded, seen.decoding)
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[model.points.index(WRIST)]
     target = in_frame(model.T_world_human, hand[None])
     log_transition = said.log_transition if model.uses_transition else None
-    result = run_controller(
-        model.robot.chain, model.settings, model.action, said.log_alpha, decoded, target, seen.control, log_transition
-    )
+
+    def run(chain: ArmChain, decoded: np.ndarray, carry: ControlCarry) -> ControlResult:
+        return run_controller(
+            chain, model.settings, model.action, said.log_alpha, decoded, target, carry, log_transition
+        )
+
+    result = run(model.robot.chain, moved.joints, seen.control)
+    others = {
+        arm: run(model.robot.arms[arm], joints, seen.others.get(arm) or initial_carry(model.robot.arms[arm]))
+        for arm, joints in moved.others.items()
+    }
     command = Command(
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
-        joints_decoded=decoded[0],
+        joints_decoded=moved.joints[0],
         joints_commanded=result.joints[0],
         target=target[0],
         contact=bool(result.contact[0]),
         stiffness=result.stiffness[0],
+        others_decoded={arm: joints[0] for arm, joints in moved.others.items()},
+        others_commanded={arm: one.joints[0] for arm, one in others.items()},
     )
-    return seen._replace(models=models, decoding=following, control=result.carry), command
+    return seen._replace(
+        models=models,
+        decoding=moved.carry,
+        control=result.carry,
+        others={arm: one.carry for arm, one in others.items()},
+    ), command
 
 
 def _observe(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> Carry:

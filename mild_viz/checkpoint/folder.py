@@ -145,6 +145,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         transition_states=parts.transition_states,
         placement=config.placement,
         meeting=config.meeting,
+        workspace=config.workspace,
         hidden=config.hidden,
         training=config.training,
         metrics=config.metrics,

@@ -260,7 +260,7 @@ def control_loop(
         contact[k] = (contact_states >> active) & 1 == 1
         command, target = commands[k], targets[k]
         prior, weight = (previous, 0.0) if controller == BASE_IK else (decoded[k], lambda_q)
-        if controller != MILD and (contact[k] or controller == BASE_IK):
+        if controller == BASE_IK or (controller == MILD_IK and contact[k]):
             solve_ik_one(arm, target, prior, lambda_x, weight, terms, command, scratch)
         else:
             _copy(prior, command)
