@@ -122,7 +122,7 @@ class RunOptions:
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
         checkpoint = load_checkpoint(self.checkpoint or paths.default_checkpoint(self.dataset))
         settings = ControlSettings(
-            controller=self.controller or CONTROLLERS_OF[checkpoint.decodes][0],
+            controller=self.controller or CONTROLLERS_OF[checkpoint.decodes][-1],
             lambda_x=self.lambda_x,
             lambda_q=self.lambda_q,
             contact_states=None if self.contact_states is None else frozenset(self.contact_states),

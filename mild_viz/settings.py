@@ -62,11 +62,11 @@ CONTROLLERS = ("base-ik", "mild", "mild-ik", "task-space")
 in contact, or inverse kinematics of all arms to the decoded hands."""
 
 CONTROLLERS_OF = {
-    "joints": ("mild-ik", "mild", "base-ik"),
-    "arm": ("mild-ik", "mild", "base-ik"),
+    "joints": ("base-ik", "mild", "mild-ik"),
+    "arm": ("base-ik", "mild", "mild-ik"),
     "hands": ("task-space",),
 }
-"""Those that a model can have, by what it decodes of the partner (`Checkpoint.decodes`); the first is the default."""
+"""Those that a model can have, by what it decodes of the partner (`Checkpoint.decodes`); the last is the default."""
 
 
 def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:

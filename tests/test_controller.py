@@ -14,7 +14,7 @@ from mild_viz.robot.controller import ControlCarry, initial_carry, run_controlle
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.stiffness import HANDSHAKE_STIFFNESS
-from mild_viz.settings import CONTROLLERS, ControlSettings
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings
 
 ROBOT = load_robot("pepper")
 CHAIN = ROBOT.chain
@@ -75,7 +75,7 @@ def plain_loop(chain: ArmChain, settings: ControlSettings, action: str, log_alph
     return np.array(joints), np.array(contact), np.array(stiffness)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 @pytest.mark.parametrize("action", ["handshake", "rocket"])
 @pytest.mark.parametrize("smoothing", [0.8, 1.0])
 def test_equals_a_plain_loop(interaction, controller, action, smoothing):
@@ -87,7 +87,7 @@ def test_equals_a_plain_loop(interaction, controller, action, smoothing):
     np.testing.assert_array_equal(result.stiffness, stiffness)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_streaming_equals_batch_bit_for_bit(interaction, controller):
     settings = ControlSettings(controller=controller, contact_states=CONTACT)
     batch = run(interaction, settings)
@@ -105,7 +105,7 @@ def test_streaming_equals_batch_bit_for_bit(interaction, controller):
         np.testing.assert_array_equal(carry.flags, batch.carry.flags)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_commands_stay_within_the_limits(interaction, controller):
     joints = run(interaction, ControlSettings(controller=controller, contact_states=CONTACT)).joints
     assert np.all((joints >= CHAIN.lower) & (joints <= CHAIN.upper))

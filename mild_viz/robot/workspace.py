@@ -37,8 +37,8 @@ SPACING = 0.05
 REACHED = 0.01
 """A point is reached if the hand comes this near [m], with the prior of `retarget_arm`."""
 
-SCALES = sorted(product(np.arange(20, 4, -1) / 20.0, repeat=3), key=lambda scale: -np.prod(scale))
-"""Scales of the axes that are tried, 0.25 to 1 each, the largest volume first."""
+SCALES = sorted(product(np.arange(10, 1, -1) / 10.0, repeat=3), key=lambda scale: -np.prod(scale))
+"""Scales of the axes that are tried, 0.2 to 1 each, the largest volume first."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def hand_map(robot: RobotModel, workspace: Workspace) -> HandMap:
         if len(fits):
             chosen = fits[np.linalg.norm(fits - fits.mean(axis=0), axis=1).argmin()]
             return HandMap(scale, chosen, workspace)
-    raise UserError(f"robot '{robot.name}' reaches less than a quarter of where the hands of the recordings are")
+    raise UserError(f"robot '{robot.name}' reaches less than a fifth of where the hands of the recordings are")
 
 
 def reached(arm: ArmChain, axes: Sequence[Float[np.ndarray, "_"]]) -> Bool[np.ndarray, "X Y Z"]:

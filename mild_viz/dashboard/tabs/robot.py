@@ -11,7 +11,7 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, sentence, set_content, widget_id
 from mild_viz.robot.stiffness import COMPLIANT_ACTIONS
 from mild_viz.rollout import Rollout
-from mild_viz.settings import CONTROLLERS, ControlSettings, Placement
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings, Placement
 from mild_viz.trial import Trial
 
 WEIGHT_EXPONENTS = (-4.0, 2.0)
@@ -27,8 +27,9 @@ class RobotTab:
     def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
         default = ControlSettings()
         self._controller = gui.add_dropdown(
-            "Controller", CONTROLLERS, initial_value=default.controller,
-            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states.",
+            "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
+            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states. "
+            "task-space: both arms to the decoded hands.",
         )  # fmt: skip
         self._lambda_x = self._weight(gui, "λx", default.lambda_x, "Weight of reaching the hand (power of ten).")
         self._lambda_q = self._weight(gui, "λq", default.lambda_q, "Weight of staying at the decoded joints.")
@@ -80,6 +81,10 @@ class RobotTab:
 
     def read(self, checkpoint: Checkpoint, trial: Trial, contact_states: frozenset[int]) -> ControlSettings:
         """The chosen settings. The placement is the trial's own until a person moves it."""
+        controllers = CONTROLLERS_OF[checkpoint.decodes]
+        if tuple(self._controller.options) != controllers:
+            self._controller.options = controllers
+            self._controller.value = controllers[-1]
         weights = {}
         for name, slider in (("λx", self._lambda_x), ("λq", self._lambda_q)):
             weights[name] = float(f"{10.0 ** number(slider):.3g}")
