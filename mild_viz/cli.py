@@ -13,12 +13,14 @@ import tyro
 
 from mild_viz.errors import UserError
 from mild_viz.evaluate_commands import evaluate, report
+from mild_viz.live_commands import live
 from mild_viz.run_options import (
     OptionalInt,
     OptionalPath,
     OptionalText,
     OptionalVariant,
     RunOptions,
+    SourceName,
     check_output,
     documented,
     leave,
@@ -33,6 +35,7 @@ def app(
     trial: OptionalInt = None,
     variant: OptionalVariant = None,
     robot: OptionalText = None,
+    robot_source: SourceName = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -53,9 +56,12 @@ def app(
             Example: --trial 5
         variant: Variant of MILD to show first (how the robot's decoder was trained and conditioned; the README
             has the table). Default: v3.1, if the model has it. Example: --variant v2.1
-        robot: Robot to control: pepper, panda, yumi, or the path of a URDF file with the joints that the model
-            drives; meshes named package://... are looked up beside the file. Default: the robot that the model was
-            trained for. Example: --robot ~/pepper.urdf
+        robot: Robot to control: pepper, panda, yumi, kobo, a folder with a robot.toml, or the path of a URDF file with
+            the joints that the model drives; meshes named package://... are looked up beside the file. Default: the
+            robot that the model was trained for. Example: --robot ~/pepper.urdf
+        robot_source: Where the robot's looks come from: own, or robot_descriptions, the Python package that downloads
+            the manufacturer's meshes (needs: pip install 'mild-viz[robots]'). Without network ours are shown.
+            Example: --robot-source robot_descriptions
         host: Network address to listen on. There is no password: leave it at this machine's own address unless
             everybody on the network may use the page. Example: --host 0.0.0.0
         port: TCP port to listen on. Example: --port 9000
@@ -70,6 +76,7 @@ def app(
         trial=trial,
         variant=variant,
         robot=robot,
+        robot_source=robot_source,
         host=host,
         port=port,
         open_browser=open_browser,
@@ -199,6 +206,7 @@ COMMANDS = {
     "sweep": sweep,
     "evaluate": evaluate,
     "report": report,
+    "live": live,
     "rollout": rollout,
     "record": record,
     "import-published": import_published,

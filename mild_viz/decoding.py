@@ -24,6 +24,7 @@ from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.objective.terms import IKTerms
 from mild_viz.robot.retarget_arm import MAX_RATE, PRIOR
 from mild_viz.robot.robots import robot_of
+from mild_viz.robot.source import RobotSource
 from mild_viz.robot.workspace import ARM_OF, HandMap, hand_map
 from mild_viz.trial import ARM_POINTS, HAND_POINTS, Trial
 
@@ -57,6 +58,8 @@ class JointDecoding:
     """The model decodes the joints of the robot that it was trained for."""
 
     joint_names: tuple[str, ...]
+    other_arms: tuple[str, ...] = ()
+    """The arms that it moves beside the first one."""
 
     def start(self) -> Float[np.ndarray, " J"]:
         """The carry before the first window."""
@@ -80,6 +83,7 @@ class ArmDecoding:
     robot: RobotModel
     rate: float
     """Frames a second [Hz]."""
+    other_arms: tuple[str, ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -117,6 +121,11 @@ class HandDecoding:
     @property
     def joint_names(self) -> tuple[str, ...]:
         return self.robot.chain.joint_names
+
+    @property
+    def other_arms(self) -> tuple[str, ...]:
+        first = next(iter(self.robot.arms))
+        return tuple(arm for arm in ARM_OF.values() if arm != first)
 
     def start(self) -> Float[np.ndarray, "_"]:
         """The carry before the first window: there are no joints yet."""
@@ -170,15 +179,16 @@ def points_of(features: Float[np.ndarray, "N Y"], n_points: int) -> Float[np.nda
     return features[:, : 3 * n_points].reshape(-1, n_points, 3)
 
 
-def open_robot(checkpoint: Checkpoint, robot: str | None = None) -> RobotModel:
+def open_robot(checkpoint: Checkpoint, robot: str | None = None, source: RobotSource = "own") -> RobotModel:
     """The robot of a name or path, with the joints that the model drives. `UserError` where it lacks them.
 
     Default: the robot that the model was trained for; for a model of a second human, that of its dataset.
+    `source`: see `load_robot`.
     """
     interface = checkpoint.robot
     if interface is None:
-        return load_robot(robot or robot_of(checkpoint.dataset))
-    return load_robot(robot or interface.name, interface.joint_names, interface.end_effector)
+        return load_robot(robot or robot_of(checkpoint.dataset), source=source)
+    return load_robot(robot or interface.name, interface.joint_names, interface.end_effector, source)
 
 
 def hand_map_of(checkpoint: Checkpoint, robot: RobotModel) -> HandMap | None:

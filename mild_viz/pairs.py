@@ -126,7 +126,7 @@ def check_rate(rate: float | None, model: str, trials: Sequence[Trial]) -> None:
         UserError: naming both rates and the first such trial.
     """
     for trial in trials:
-        if rate is not None and abs(trial.rate - rate) > 0.01 * rate:  # clocks of recordings are not exact
+        if rates_differ(rate, trial.rate):
             raise UserError(
                 f"checkpoint {model} was trained on {rate:g} Hz, trial {trial.name} has {trial.rate:g} Hz; "
                 f"valid: a dataset of {rate:g} Hz, or a model trained on this one"
@@ -141,6 +141,11 @@ def check_points(points: Sequence[str], model: str, trials: Sequence[Trial]) -> 
                 f"checkpoint {model} reads {', '.join(points)} of the human, trial {trial.name} gives "
                 f"{', '.join(trial.points)}; valid: a dataset that gives {', '.join(points)}"
             )
+
+
+def rates_differ(rate: float | None, other: float) -> bool:
+    """Whether a rate [Hz] is another one than a model's; clocks are not exact, and a model may not know its own."""
+    return rate is not None and not abs(other - rate) <= 0.01 * rate
 
 
 def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) -> Windows:

@@ -1,4 +1,4 @@
-"""The whole chain on one page: encode -> filter -> condition -> decode, then gate -> IK -> smooth -> stiffness.
+"""The whole chain on one page: encode -> filter -> condition -> decode, then gate -> IK -> smooth -> stiffen -> limit.
 
 `infer` depends on model, variant and trial; `control` on everything that a person may turn while watching.
 Both are pure functions: a page, a command or a test calls them alike.
@@ -20,9 +20,9 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
-from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import in_frame
-from mild_viz.robot.controller import ControlResult, initial_carry, run_controller
+from mild_viz.robot.control.controller import Frames, make_controller
+from mild_viz.robot.control.other_arm import move_other_arms
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
@@ -95,9 +95,9 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         phase=None if trial.phase is None else trial.phase[newest],
         decodes=checkpoint.decodes,
         partner_decoded=moved.partner,
+        partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
         others_decoded=moved.others,
         others_truth={arm: joints[first] for arm, joints in truth.others.items()},
-        partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
     )
 
 
@@ -117,7 +117,8 @@ def control(
     """The commands that a controller makes of an inference, and where everything stands: world is the robot's base.
 
     Raises:
-        UserError: for a controller that does not go with what the model decodes, or contact states that do not exist.
+        UserError: for a controller that does not go with what the model decodes, contact states that do not exist, or
+            another arm that cannot be moved as the settings say.
     """
     choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[inference.decodes])
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
@@ -125,21 +126,24 @@ def control(
     stored, follow = checkpoint.placement_for(robot.chain), hand_map_of(checkpoint, robot)
     placed = place_human(robot.chain, trial, settings.placement, stored, follow)
     target = in_frame(placed.T_world_human, inference.human_hand)
-
-    def run(chain: ArmChain, decoded: np.ndarray) -> ControlResult:
-        return run_controller(
-            chain,
-            settings,
-            inference.action,
-            inference.log_alpha_human,
-            decoded,
-            target,
-            initial_carry(chain),
-            inference.log_transition if uses_transition(settings, transition) else None,
-        )
-
-    result = run(robot.chain, inference.joints_decoded)
-    others = {arm: run(robot.arms[arm], decoded).joints for arm, decoded in inference.others_decoded.items()}
+    rules = checkpoint.contact_rules_of(inference.action)
+    controller = make_controller(robot, settings, rules, inference.n_states, inference.rate)
+    crossing = inference.log_transition if uses_transition(settings, transition) else None
+    frames = Frames(
+        log_alpha=inference.log_alpha_human,
+        log_transition=np.full(inference.n_windows, -np.inf) if crossing is None else crossing,
+        decoded=inference.joints_decoded,
+        targets=target,
+        tracked=inference.tracked,
+        seconds=np.full(inference.n_windows, 1.0 / inference.rate),
+    )
+    result = controller.run(frames, controller.start())
+    others = move_other_arms(
+        robot, controller, frames, inference.human_skeleton, placed.T_world_human, inference.others_decoded
+    )
+    commanded, decoded = (
+        {arm.name: getattr(arm, f"joints_{kind}") for arm in others} for kind in ("commanded", "decoded")
+    )
     end_effector = robot.end_effector(result.joints)
     durations, occupancy = state_visits(inference.active_state, inference.n_states, inference.rate)
     return Rollout(
@@ -147,21 +151,23 @@ def control(
         controller=settings.controller,
         robot=robot.name,
         joints_commanded=result.joints,
-        others_commanded=others,
         end_effector=end_effector,
         end_effector_decoded=robot.end_effector(inference.joints_decoded),
         target=target,
         hand_distance=np.linalg.norm(end_effector - target, axis=1),
         contact=result.contact,
         stiffness=result.stiffness,
+        compliant=rules.compliant,
+        fired=result.fired,
         T_world_human=placed.T_world_human,
         link_names=robot.link_names,
-        link_poses=robot.link_poses(result.joints, inference.action, others),
-        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action, inference.others_decoded),
+        link_poses=robot.link_poses(result.joints, inference.action, commanded),
+        link_poses_decoded=robot.link_poses(inference.joints_decoded, inference.action, decoded),
         state_durations=durations,
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),
         placement=placed.placement,
+        other_arms=others,
     )
 
 

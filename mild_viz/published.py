@@ -25,6 +25,7 @@ from mild_viz.data.npz import MAX_BYTES
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
+from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.robots import ROBOTS
 from mild_viz.settings import POINT_FEATURES, VARIANTS, WINDOW, choose
 from mild_viz.trial import ARM_POINTS
@@ -210,6 +211,7 @@ def import_published(file: Path, out: Path) -> Checkpoint:
         hmms=hmms,
         robot_vaes={variant: robot_vae},
         robot=RobotInterface("pepper", pepper.joint_names, pepper.end_effector),
+        contact_rules={action: DEFAULT_RULES[action] for action in hmms},
         training={
             "command": f"mild-viz import-published {file.name} --out {out.name}",
             "source": "the authors' published file",

@@ -17,7 +17,7 @@ SAVED = (
     "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state", "log_transition",
     "human_latent_mean", "human_latent_covariance", "robot_latent_mean", "robot_latent_covariance",
     "robot_latent_truth", "joints_decoded", "joints_commanded", "joints_truth", "end_effector", "target",
-    "contact", "stiffness",
+    "contact", "stiffness", "fired",
 )  # fmt: skip
 """Names of the arrays in a rollout file; row n of all of them belongs to human window n."""
 
@@ -111,6 +111,34 @@ class Inference:
 
 
 @dataclass(frozen=True, eq=False)
+class OtherArm:
+    """What an arm does that moves beside the one that interacts; K joints."""
+
+    name: str
+    controller: str
+    joint_names: tuple[str, ...]
+    joints_decoded: Float[np.ndarray, "N K"]
+    """The decoded joints, its own or mirrored; the resting joints where the controller takes none."""
+    joints_commanded: Float[np.ndarray, "N K"]
+    end_effector: Float[np.ndarray, "N 3"]
+    """World [m]."""
+    target: Float[np.ndarray, "N 3"]
+    """The human's left hand, world [m]; NaN where it is not known."""
+    hand_distance: Float[np.ndarray, " N"]
+    """|end_effector - target| [m]."""
+    stiffness: Float[np.ndarray, "N K"]
+    fired: Int[np.ndarray, " N"]
+    """As `Rollout.fired`, of this arm."""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+OTHER_SAVED = ("joints_commanded", "end_effector", "target", "stiffness", "fired")
+"""Names of the arrays of another arm in a rollout file, there with the arm's name before them."""
+
+
+@dataclass(frozen=True, eq=False)
 class Rollout:
     """An `Inference` and the commands that a controller makes of it. World is the robot's base frame."""
 
@@ -128,6 +156,10 @@ class Rollout:
     contact: Bool[np.ndarray, " N"]
     stiffness: Float[np.ndarray, "N J"]
     """Fraction of full joint stiffness, 0 to 1."""
+    compliant: bool
+    """Whether the stiffness is lowered in contact, by the rules of the action (not by the settings)."""
+    fired: Int[np.ndarray, " N"]
+    """Which rules fired, as bit masks: bit i is `robot.control.rules.RULES[i]`."""
     T_world_human: Float[np.ndarray, "4 4"]
     link_names: tuple[str, ...]
     link_poses: Float[np.ndarray, "N L 7"]
@@ -141,8 +173,9 @@ class Rollout:
     contact_states: frozenset[int]
     placement: Placement
     """Where the human stands, and in words for the page where that comes from."""
-    others_commanded: Mapping[str, Float[np.ndarray, "N _"]] = field(default_factory=dict)
-    """`joints_commanded` of the robot's other arms, by name; those that are not named rest."""
+
+    other_arms: tuple[OtherArm, ...] = ()
+    """The arms that move beside the one that interacts; those that only rest are not among them."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -152,8 +185,9 @@ class Rollout:
         return getattr(self if name in type(self).__dataclass_fields__ else self.inference, name)
 
     def save(self, path: Path) -> None:
-        """Write the arrays named in `SAVED` to an .npz file, atomically."""
+        """Write the arrays named in `SAVED`, and in `OTHER_SAVED` of every other arm, to an .npz file, atomically."""
         arrays = {name: self.array(name) for name in SAVED}
+        arrays |= {f"{arm.name}_{name}": getattr(arm, name) for arm in self.other_arms for name in OTHER_SAVED}
 
         def write(temporary: Path) -> None:
             with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name

@@ -68,6 +68,9 @@ CONTROLLERS_OF = {
 }
 """Those that a model can have, by what it decodes of the partner (`Checkpoint.decodes`); the last is the default."""
 
+OTHER_ARM = ("rest", "base-ik", "mild", "mild-ik")
+"""What a robot's other arms do; see `pipeline.control`. In task space the model says."""
+
 
 def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:
     """Return `value` if it is valid, else raise an error that lists what would be."""
@@ -115,6 +118,28 @@ class InferSettings:
 
 
 @dataclass(frozen=True)
+class Watch:
+    """When an observation of the human is no longer one to go by, and when the human is gone."""
+
+    max_age: float = 0.25
+    """The robot stops where it is when the human was last seen longer ago than this [s]. A hand at 2 m/s is then
+    somewhere else by half a metre."""
+    max_speed: float = 15.0
+    """A hand that moved faster than this between two observations has jumped [m/s]: more than anyone greets with, and
+    more than the 14.4 m/s between two frames that the tracking noise of NuiSI makes of 4 m/s."""
+    gone_after: float = 1.5
+    """The robot returns to rest when the human was last seen longer ago than this [s]: longer than trackers lose
+    someone who is still there."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_age", "max_speed", "gone_after"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number above 0")
+        if self.gone_after < self.max_age:
+            raise UserError(f"gone_after is {self.gone_after}; valid: max_age, {self.max_age}, or more")
+
+
+@dataclass(frozen=True)
 class ControlSettings:
     """What decides the command that is sent to the robot. A change here reruns only `control`."""
 
@@ -131,9 +156,15 @@ class ControlSettings:
     """Weight of the new command in the moving average; 1 switches it off."""
     placement: Placement | None = None
     """None: the checkpoint's own, or the recording's where it has one world frame."""
+    other_arm: str = "rest"
+    """What the arms do that do not interact, one of `OTHER_ARM`: `mild` mirrors the decoded joints, `base-ik` follows
+    the human's left hand, `mild-ik` does both."""
+    watch: Watch = Watch()
+    """What the safety filter expects of the observations."""
 
     def __post_init__(self) -> None:
         choose("controller", self.controller, CONTROLLERS)
+        choose("other_arm", self.other_arm, OTHER_ARM)
         for name in ("lambda_x", "lambda_q"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise UserError(f"{name} is {getattr(self, name)}; valid: a finite number of 0 or more")

@@ -1,5 +1,7 @@
 """The same chain one observation at a time: step(model, carry, observation) -> (carry, command).
 
+Where an observation is overdue, idle(model, carry, seconds) says what to send instead.
+
 Fed with the frames of a trial it gives the numbers of `pipeline.infer` and `pipeline.control` row by row.
 """
 
@@ -7,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,14 +17,15 @@ from jaxtyping import Float
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import max_gap
 from mild_viz.decoding import Decoding, decoding_of
+from mild_viz.errors import UserError
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
+from mild_viz.pairs import rates_differ
 from mild_viz.pipeline import uses_transition, with_contact_states
 from mild_viz.prediction import advance
-from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import in_frame
-from mild_viz.robot.controller import ControlCarry, ControlResult, initial_carry, run_controller
+from mild_viz.robot.control.controller import ControlCarry, Controller, ControlResult, Frames, make_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import POINT_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.settings import CONTROLLERS_OF, POINT_FEATURES, WINDOW, ControlSettings, choose
 from mild_viz.trial import WRIST
 
 
@@ -38,6 +41,9 @@ class StreamModel:
     robot: RobotModel
     decoding: Decoding
     settings: ControlSettings
+    controller: Controller
+    others: Mapping[str, Controller]
+    """Those of the robot's other arms that the model moves, by name."""
     uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
     rate: float
@@ -63,15 +69,22 @@ class Carry(NamedTuple):
     """The last decoded joints."""
     control: ControlCarry
     others: Mapping[str, ControlCarry]
-    """Those of the robot's other arms that move, by name."""
+    """Of the robot's other arms that the model moves, by name; `joints` is what to send to each."""
+    command: Command | None
+    """The last command."""
 
 
 class Command(NamedTuple):
-    """The answer to one observation; `None` fields until the first window is full."""
+    """What to send to the robot, and what led to it.
+
+    From `idle`, what the model says is as it was at the last observation, and NaN (and state -1) before the first.
+    """
 
     log_alpha: Float[np.ndarray, " S"]
     log_transition: float
     active_state: int
+    human_latent_mean: Float[np.ndarray, " D"]
+    human_latent_std: Float[np.ndarray, " D"]
     robot_latent_mean: Float[np.ndarray, " D"]
     robot_latent_covariance: Float[np.ndarray, "D D"]
     joints_decoded: Float[np.ndarray, " J"]
@@ -79,9 +92,8 @@ class Command(NamedTuple):
     target: Float[np.ndarray, " 3"]
     contact: bool
     stiffness: Float[np.ndarray, " J"]
-    others_decoded: Mapping[str, Float[np.ndarray, "_"]]
-    """The decoded joints of the robot's other arms that move, by name."""
-    others_commanded: Mapping[str, Float[np.ndarray, "_"]]
+    fired: int
+    """Which rules fired, as a bit mask: bit i is `robot.control.rules.RULES[i]`."""
 
 
 def stream_model(
@@ -93,17 +105,39 @@ def stream_model(
     T_world_human: Float[np.ndarray, "4 4"],
     rate: float,
 ) -> StreamModel:
-    """Everything that a stream of observations at `rate` [Hz] needs."""
+    """Everything that a stream of observations at `rate` [Hz] needs.
+
+    Raises:
+        UserError: if the checkpoint does not know the variant or the action, or was trained at another rate; or if the
+            settings move another arm: a stream drives the arms that the model moves.
+    """
     choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
+    if rates_differ(checkpoint.rate, rate):
+        raise UserError(
+            f"checkpoint {checkpoint.name} was trained on {checkpoint.rate:g} Hz, the stream has {rate:g} Hz; valid: "
+            f"observations at {checkpoint.rate:g} Hz, or a model trained on such"
+        )
+    if settings.other_arm != "rest":
+        raise UserError(
+            f"other_arm is {settings.other_arm}; valid for a stream, which drives the arms that the model moves: rest"
+        )
+    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[checkpoint.decodes])
     settings = with_contact_states(settings, checkpoint, variant, action)
+    rules, decoding = checkpoint.contact_rules_of(action), decoding_of(checkpoint, robot, rate)
+
+    def controller(arm: str | None) -> Controller:
+        return make_controller(robot, settings, rules, checkpoint.n_states, rate, arm)
+
     return StreamModel(
         models=checkpoint.members(variant),
         points=checkpoint.points,
         variant=variant,
         action=action,
         robot=robot,
-        decoding=decoding_of(checkpoint, robot, rate),
+        decoding=decoding,
         settings=settings,
+        controller=controller(None),
+        others={arm: controller(arm) for arm in decoding.other_arms},
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,
@@ -112,16 +146,21 @@ def stream_model(
 
 
 def start(model: StreamModel) -> Carry:
-    """The state before the first observation."""
+    """The state before the first observation: the robot rests."""
     empty = np.full((WINDOW, POINT_FEATURES * len(model.points)), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), initial_carry(model.robot.chain), {})
+    others = {arm: controller.start() for arm, controller in model.others.items()}
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), model.controller.start(), others, None)
 
 
-def step(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> tuple[Carry, Command | None]:
+def step(
+    model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"], seconds: float | None = None
+) -> tuple[Carry, Command | None]:
     """Take one observation of the human's `points` (an arm: shoulder, elbow, wrist) [m]; NaN where lost.
 
-    Returns the new carry, and the command for the next frame: None until five observations were taken.
+    `seconds` is the time since the last command [s], which the limits of the robot are about: by default that between
+    two observations. Returns the new carry, and the command for the next frame: None until five observations were
+    taken.
     """
     seen = _observe(model, carry, points)
     if seen.n_frames < WINDOW:
@@ -132,39 +171,73 @@ def step(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> 
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
     moved = model.decoding.move(said.decoded, seen.decoding)
     hand = np.full(3, np.nan) if seen.previous is None else seen.previous[model.points.index(WRIST)]
-    target = in_frame(model.T_world_human, hand[None])
-    log_transition = said.log_transition if model.uses_transition else None
-
-    def run(chain: ArmChain, decoded: np.ndarray, carry: ControlCarry) -> ControlResult:
-        return run_controller(
-            chain, model.settings, model.action, said.log_alpha, decoded, target, carry, log_transition
-        )
-
-    result = run(model.robot.chain, moved.joints, seen.control)
+    frames = Frames(
+        log_alpha=said.log_alpha,
+        log_transition=said.log_transition if model.uses_transition else np.full(1, -np.inf),
+        decoded=moved.joints,
+        targets=in_frame(model.T_world_human, hand[None]),
+        tracked=np.array([not np.isnan(points).any()]),
+        seconds=np.array([1.0 / model.rate if seconds is None else seconds], dtype=float),
+    )
+    result = model.controller.run(frames, seen.control)
     others = {
-        arm: run(model.robot.arms[arm], joints, seen.others.get(arm) or initial_carry(model.robot.arms[arm]))
-        for arm, joints in moved.others.items()
+        arm: controller.run(frames._replace(decoded=moved.others[arm]), seen.others[arm])
+        for arm, controller in model.others.items()
     }
     command = Command(
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
         active_state=int(said.log_alpha[0].argmax()),
+        human_latent_mean=said.human_mean[0],
+        human_latent_std=said.human_std[0],
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
         joints_decoded=moved.joints[0],
-        joints_commanded=result.joints[0],
-        target=target[0],
-        contact=bool(result.contact[0]),
-        stiffness=result.stiffness[0],
-        others_decoded={arm: joints[0] for arm, joints in moved.others.items()},
-        others_commanded={arm: one.joints[0] for arm, one in others.items()},
+        target=frames.targets[0],
+        **_sent(result),
     )
-    return seen._replace(
-        models=models,
-        decoding=moved.carry,
-        control=result.carry,
-        others={arm: one.carry for arm, one in others.items()},
-    ), command
+    seen = seen._replace(models=models, decoding=moved.carry, control=result.carry, others=_carries(others))
+    return seen._replace(command=command), command
+
+
+def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Command]:
+    """What to send when no usable observation came, `seconds` after the last command.
+
+    The robot stops where it is, and returns to rest when the human is gone (`settings.Watch`), within the same limits.
+    Where a frame was due and nothing came, `step` with NaN keeps the model's clock; this is for everything else. An
+    observation after a pause longer than `data.windows` bridges is the first of a new window.
+    """
+    result = model.controller.idle(carry.control, seconds)
+    others = {arm: controller.idle(carry.others[arm], seconds) for arm, controller in model.others.items()}
+    if carry.command is None:
+        size, n_states = model.models[0].human_vae.latent_size, model.controller.n_states
+        nothing = {
+            "log_alpha": np.full(n_states, np.nan), "log_transition": np.nan, "active_state": -1,
+            "human_latent_mean": np.full(size, np.nan), "human_latent_std": np.full(size, np.nan),
+            "robot_latent_mean": np.full(size, np.nan), "robot_latent_covariance": np.full((size, size), np.nan),
+            "joints_decoded": np.full(model.robot.chain.n_joints, np.nan), "target": np.full(3, np.nan),
+        }  # fmt: skip
+        command = Command(**nothing, **_sent(result))
+    else:
+        command = carry.command._replace(**_sent(result))
+    if result.carry.age * model.rate > model.max_gap:
+        empty = np.full_like(carry.features, np.nan)
+        carry = carry._replace(features=empty, previous=None, last_seen=None)
+    return carry._replace(control=result.carry, others=_carries(others), command=command), command
+
+
+def _carries(results: Mapping[str, ControlResult]) -> dict[str, ControlCarry]:
+    return {arm: result.carry for arm, result in results.items()}
+
+
+def _sent(result: ControlResult) -> dict[str, Any]:
+    """The fields of a command that the controller makes."""
+    return {
+        "joints_commanded": result.joints[0],
+        "contact": bool(result.contact[0]),
+        "stiffness": result.stiffness[0],
+        "fired": int(result.fired[0]),
+    }
 
 
 def _observe(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> Carry:

@@ -12,10 +12,12 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.latent.vae import VAE
+from mild_viz.robot.model import load_robot
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import ControlSettings, InferSettings, Placement, Settings
 from mild_viz.trial import Trial
 
+PEPPER = load_robot("pepper")
 JOINTS = ("RShoulderPitch", "RShoulderRoll", "RElbowYaw", "RElbowRoll")
 
 
@@ -29,7 +31,7 @@ def make_trial(index: int = 0) -> Trial:
 
 def make_choice(checkpoint: Checkpoint, trial: int = 0, variant: str = "v3.1", **control: Any) -> Choice:
     settings = Settings(InferSettings(trial=trial, variant=variant), ControlSettings(**control))
-    return Choice(settings, ViewSettings(), checkpoint, make_trial(trial))
+    return Choice(settings, ViewSettings(), checkpoint, make_trial(trial), PEPPER)
 
 
 def with_view(choice: Choice, **view: Any) -> Choice:
@@ -88,6 +90,8 @@ def make_rollout(inference: Inference, controller: str = "mild-ik", **fields: An
         "hand_distance": np.linspace(0.5, 0.0, n),
         "contact": inference.active_state == 1,
         "stiffness": np.ones((n, 4)),
+        "compliant": True,
+        "fired": np.zeros(n, dtype=np.int64),
         "T_world_human": np.eye(4),
         "link_names": ("torso",),
         "link_poses": np.zeros((n, 1, 7)),

@@ -93,6 +93,8 @@ def scene_rollout(robot: RobotModel, inference: Inference, **fields: Any) -> Rol
         "hand_distance": np.linalg.norm(end_effector - target, axis=1),
         "contact": contact,
         "stiffness": np.where(contact[:, None], 0.4, np.ones((1, 4))),
+        "compliant": True,
+        "fired": np.zeros(inference.n_windows, dtype=np.int64),
         "T_world_human": T,
         "link_names": robot.link_names,
         "link_poses": robot.link_poses(commanded),

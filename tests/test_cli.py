@@ -15,7 +15,8 @@ import pytest
 
 from mild_viz import cli, paths, run_options
 from mild_viz.errors import UserError
-from mild_viz.settings import CONTROLLERS, VARIANTS
+from mild_viz.robot.source import RobotSource
+from mild_viz.settings import CONTROLLERS, OTHER_ARM, VARIANTS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 COMMANDS = [name for name in cli.COMMANDS if name != "data"] + [f"data {name}" for name in cli.DATA_COMMANDS]
@@ -67,6 +68,8 @@ def test_help_fits_a_narrow_terminal(capsys: pytest.CaptureFixture[str], monkeyp
 def test_choices_are_those_of_the_tables() -> None:
     assert get_args(run_options.VariantName) == tuple(VARIANTS)
     assert get_args(run_options.ControllerName) == CONTROLLERS
+    assert get_args(run_options.SourceName) == get_args(RobotSource)
+    assert get_args(run_options.OtherArmName) == OTHER_ARM
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ import pytest
 
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
-from mild_viz.robot.controller import ControlCarry, initial_carry, run_controller, state_mask
+from mild_viz.robot.control.controller import ControlCarry, Controller, make_controller, state_mask
+from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
-from mild_viz.robot.stiffness import HANDSHAKE_STIFFNESS
 from mild_viz.settings import CONTROLLERS_OF, ControlSettings
+from tests.controllers import LOW, RATE, cut, frames, unhindered
 
 ROBOT = load_robot("pepper")
 CHAIN = ROBOT.chain
@@ -39,8 +40,8 @@ def interaction() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def run(interaction, settings: ControlSettings, action: str = "handshake"):
-    log_alpha, decoded, targets = interaction
-    return run_controller(CHAIN, settings, action, log_alpha, decoded, targets, initial_carry(CHAIN))
+    controller = unhindered(CHAIN, settings, action, STATES)
+    return controller.run(frames(*interaction), controller.start())
 
 
 def plain_loop(chain: ArmChain, settings: ControlSettings, action: str, log_alpha, decoded, targets):
@@ -71,7 +72,7 @@ def plain_loop(chain: ArmChain, settings: ControlSettings, action: str, log_alph
         lowered = soft and settings.stiffness and action == "handshake"
         joints.append(new)
         contact.append(in_contact)
-        stiffness.append(np.full(chain.n_joints, HANDSHAKE_STIFFNESS if lowered else 1.0))
+        stiffness.append(np.full(chain.n_joints, LOW if lowered else 1.0))
     return np.array(joints), np.array(contact), np.array(stiffness)
 
 
@@ -87,37 +88,34 @@ def test_equals_a_plain_loop(interaction, controller, action, smoothing):
     np.testing.assert_array_equal(result.stiffness, stiffness)
 
 
+def own(settings: ControlSettings, action: str = "handshake") -> Controller:
+    """With the arm's own limits."""
+    return make_controller(ROBOT, settings, DEFAULT_RULES[action], STATES, RATE)
+
+
 @pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_streaming_equals_batch_bit_for_bit(interaction, controller):
-    settings = ControlSettings(controller=controller, contact_states=CONTACT)
-    batch = run(interaction, settings)
+    used, whole = own(ControlSettings(controller=controller, contact_states=CONTACT)), frames(*interaction)
+    batch = used.run(whole, used.start())
     for size in (1, 7):
-        carry, parts = initial_carry(CHAIN), []
+        carry, parts = used.start(), []
         for begin in range(0, N, size):
-            log_alpha, decoded, targets = (array[begin : begin + size] for array in interaction)
-            parts.append(run_controller(CHAIN, settings, "handshake", log_alpha, decoded, targets, carry))
+            parts.append(used.run(cut(whole, slice(begin, begin + size)), carry))
             carry = parts[-1].carry
-        for field in ("joints", "contact", "stiffness"):
+        for field in ("joints", "contact", "stiffness", "fired"):
             np.testing.assert_array_equal(
                 np.concatenate([getattr(part, field) for part in parts]), getattr(batch, field)
             )
-        np.testing.assert_array_equal(carry.joints, batch.carry.joints)
-        np.testing.assert_array_equal(carry.flags, batch.carry.flags)
-
-
-@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
-def test_commands_stay_within_the_limits(interaction, controller):
-    joints = run(interaction, ControlSettings(controller=controller, contact_states=CONTACT)).joints
-    assert np.all((joints >= CHAIN.lower) & (joints <= CHAIN.upper))
+        for field in ControlCarry._fields:
+            np.testing.assert_array_equal(getattr(carry, field), getattr(batch.carry, field))
 
 
 def test_the_given_carry_is_not_changed(interaction):
-    carry = initial_carry(CHAIN)
-    before = ControlCarry(carry.joints.copy(), carry.flags.copy())
-    log_alpha, decoded, targets = interaction
-    run_controller(CHAIN, ControlSettings(contact_states=CONTACT), "handshake", log_alpha, decoded, targets, carry)
-    np.testing.assert_array_equal(carry.joints, before.joints)
-    np.testing.assert_array_equal(carry.flags, before.flags)
+    used = own(ControlSettings(contact_states=CONTACT))
+    carry, before = used.start(), used.start()
+    used.run(frames(*interaction), carry)
+    for field in ControlCarry._fields:
+        np.testing.assert_array_equal(getattr(carry, field), getattr(before, field))
 
 
 def test_ik_works_only_in_contact_and_brings_the_hand_closer(interaction):
@@ -165,8 +163,7 @@ def stiffness_of(log_alpha: np.ndarray, action: str = "handshake", **changes) ->
 
 def test_stiffness_is_lowered_in_the_contact_of_a_handshake_only():
     visits = segments(0, 1, 2, 3, 2, 4, 5)
-    low = HANDSHAKE_STIFFNESS
-    np.testing.assert_array_equal(stiffness_of(visits), [1, 1, low, low, low, 1, 1])
+    np.testing.assert_array_equal(stiffness_of(visits), [1, 1, LOW, LOW, LOW, 1, 1])
     np.testing.assert_array_equal(stiffness_of(visits, stiffness=False), np.ones(7))
     for action in ("wave", "rocket", "parachute", "handover"):
         np.testing.assert_array_equal(stiffness_of(visits, action), np.ones(7))
@@ -177,8 +174,7 @@ def test_no_back_transition_to_reaching():
     """A frame in contact that is mistaken for reaching does not stiffen the arm; the retreat does."""
     visits = segments(0, 1, 2, 1, 0, 3, 4)
     visits[3, 2] = visits[4, 3] = -1.0  # the second most likely state is one of contact
-    low = HANDSHAKE_STIFFNESS
-    np.testing.assert_array_equal(stiffness_of(visits), [1, 1, low, low, low, low, 1])
+    np.testing.assert_array_equal(stiffness_of(visits), [1, 1, LOW, LOW, LOW, LOW, 1])
     # before the first contact nothing is masked
     np.testing.assert_array_equal(stiffness_of(segments(0, 1, 0, 1)), np.ones(4))
 
@@ -202,11 +198,11 @@ def test_unknown_contact_states_are_refused(interaction):
 
 def test_control_of_a_trial_takes_milliseconds(interaction):
     """430 frames with IK in every frame, and link poses of command and ghost; 1.5 ms on an idle core."""
-    settings = ControlSettings(contact_states=frozenset(range(STATES)))
+    used = own(ControlSettings(contact_states=frozenset(range(STATES))))
     best = np.inf
     for _ in range(20):
         begin = time.perf_counter()
-        result = run(interaction, settings)
+        result = used.run(frames(*interaction), used.start())
         ROBOT.link_poses(result.joints)
         ROBOT.link_poses(interaction[1])
         best = min(best, time.perf_counter() - begin)

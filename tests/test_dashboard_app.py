@@ -86,16 +86,16 @@ def test_a_checkpoint_for_another_robot_is_refused(tmp_path: Path, model: Path, 
     save_checkpoint(other, tmp_path / "other", "for a test")
     catalog = Catalog(robot, tmp_path / "other")
     assert "drives the joints RShoulderPitch, RShoulderRoll, RElbowRoll, RElbowYaw" in str(
-        catalog.problem("other", "demo")
+        catalog.problem("other", "demo", "pepper")
     )
-    assert "other" not in catalog.models("demo")
+    assert "other" not in catalog.models("demo", "pepper")
 
 
 def test_a_model_of_two_humans_fits_every_robot_where_there_is_a_second_human(robot: RobotModel) -> None:
-    for one in (robot, load_robot("panda")):
-        catalog = Catalog(one)
-        assert "nuisi-human" in catalog.models("nuisi")
-        assert "shows none" in str(catalog.problem("nuisi-human", "yumi"))
+    catalog = Catalog(robot)
+    for one in ("pepper", "panda", "yumi", "kobo"):
+        assert "nuisi-human" in catalog.models("nuisi", one)
+        assert "shows none" in str(catalog.problem("nuisi-human", "yumi", one))
 
 
 def test_the_first_trial_is_a_test_trial_of_the_action(model: Path) -> None:
@@ -119,7 +119,7 @@ def test_only_what_fits_is_offered(
     usable, others = catalog.offers()
     assert usable == ("demo",)
     assert others["nuisi"] == "get it with: mild-viz data fetch nuisi"
-    assert catalog.models("demo")[0] == "demo-copy", "the model that was asked for comes first"
+    assert catalog.models("demo", "pepper")[0] == "demo-copy", "the model that was asked for comes first"
     (tmp_path / "nuisi").mkdir()
     (tmp_path / "nuisi" / "traj_data.npz").write_bytes(b"PK not a recording")
     usable, others = Catalog(robot, model).offers()
@@ -129,12 +129,14 @@ def test_only_what_fits_is_offered(
 def test_real_recordings_come_with_the_model_made_for_them(robot: RobotModel, dataset: Callable[[str], Any]) -> None:
     dataset("nuisi")
     catalog = Catalog(robot, paths.default_checkpoint("demo"))
-    assert catalog.models("nuisi")[0] == "nuisi-pepper" and catalog.models("demo")[0] == "demo"
+    assert catalog.models("nuisi", "pepper")[0] == "nuisi-pepper" and catalog.models("demo", "pepper")[0] == "demo"
     assert "nuisi" in catalog.offers()[0]
     dataset("yumi")
-    assert catalog.models("yumi") == () and "recorded the joints" in str(catalog.problem("demo", "yumi"))
-    assert catalog.offers()[1]["yumi"] == "it has another robot, YuMi; open it with: mild-viz app --dataset yumi"
-    assert "nuisi-human" in catalog.models("nuisi") and "handover-human" not in catalog.models("nuisi")
+    assert catalog.models("yumi", "pepper") == ()
+    assert "recorded the joints" in str(catalog.problem("demo", "yumi", "pepper"))
+    assert "yumi" in catalog.offers()[0] and catalog.robot_for("yumi", "pepper") == "yumi"
+    models = catalog.models("nuisi", "pepper")
+    assert "nuisi-human" in models and "handover-human" not in models
 
 
 @pytest.mark.parametrize(("name", "robot_name", "n_joints"), [("yumi", "yumi", 7), ("handover", "panda", 7)])
@@ -207,6 +209,38 @@ def test_switching_the_dataset_brings_its_model_actions_and_trials(
     assert session.wait_idle() and session.choice.trial.dataset == "demo"
 
 
+def test_a_robot_brings_what_moves_it_and_a_dataset_its_robot(
+    dashboard: Dashboard, dataset: Callable[[str], Any]
+) -> None:
+    dataset("nuisi")
+    dataset("yumi")
+    tab, session, scene = dashboard.controls._trial, dashboard.session, dashboard.scene
+    dashboard.controls.offer_datasets()
+
+    def choose(handle: Any, value: str) -> tuple[str, str, str]:
+        handle.value = value
+        session.mark_dirty()
+        assert session.wait_idle() and session.error is None, session.error
+        choice, rollout = session.choice, session.rollout
+        assert choice is not None and rollout is not None and rollout.robot == choice.robot.name
+        nodes = set(dashboard.server.scene._handle_from_node_name)
+        links = {name.rpartition("/")[2] for name in nodes if name.startswith("/robot/solid/")}
+        assert links == set(choice.robot.link_names), "the scene has the links of this robot and of no other"
+        assert rollout.joints_commanded.shape[1] == choice.robot.chain.n_joints
+        return choice.robot.name, choice.trial.dataset, choice.checkpoint.name
+
+    assert choose(tab._dataset, "nuisi") == ("pepper", "nuisi", "nuisi-pepper")
+    # a model of two humans moves a Panda on the same recordings
+    assert choose(tab._robot, "Panda") == ("panda", "nuisi", "nuisi-human")
+    assert "m²" in dashboard.controls._header.content
+    # YuMi's recordings have a robot of their own, whose model drives no other
+    assert choose(tab._dataset, "yumi") == ("yumi", "yumi", "yumi")
+    assert choose(tab._robot, "Pepper")[0] == "pepper"
+    assert tab._dataset.value != "yumi"
+    assert choose(tab._dataset, "demo")[:2] == ("pepper", "demo")
+    assert scene.layout is not None
+
+
 def test_ticks_are_compared_with_what_the_model_has_stored(dashboard: Dashboard, model: Path) -> None:
     states, session = dashboard.controls._states, dashboard.session
     assert states.save.disabled and "Saved:" in states._saved.content
@@ -260,7 +294,7 @@ def test_tracking_lost_for_seconds_is_drawn_as_a_gap(dashboard: Dashboard) -> No
     arm[40:100] = np.nan
     trial = replace(choice.trial, human_arm=arm, human_skeleton=None)
     inference = pipeline.infer(choice.checkpoint, trial, "v3.1")
-    gap = pipeline.control(inference, choice.checkpoint, dashboard.robot, trial, choice.settings.control)
+    gap = pipeline.control(inference, choice.checkpoint, choice.robot, trial, choice.settings.control)
     assert not gap.inference.observed.all()
     dashboard._show(gap, replace(choice, trial=trial), True)
     for frame in range(0, gap.inference.n_windows, 3):

@@ -13,7 +13,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from mild_viz.dashboard.server import check_port, free_port, is_loopback, open_server, page_url
+from mild_viz.dashboard.address import is_loopback, page_url
+from mild_viz.dashboard.server import check_port, free_port, open_server
 from mild_viz.dashboard.tabs.widgets import number, offer, on_person, option
 from mild_viz.errors import UserError
 

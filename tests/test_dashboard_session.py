@@ -14,6 +14,7 @@ from dashboard_fakes import make_checkpoint, make_choice, make_inference, make_r
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import ControlSettings
 from mild_viz.trial import Trial
@@ -36,11 +37,13 @@ class Bench:
             self.reports.append,
         )
 
-    def infer(self, checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
+    def infer(self, checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel) -> Inference:
         self.infer_hook()
         return make_inference(trial=trial.index, variant=variant)
 
-    def control(self, inference: Inference, checkpoint: Checkpoint, trial: Trial, settings: ControlSettings) -> Rollout:
+    def control(
+        self, inference: Inference, checkpoint: Checkpoint, robot: RobotModel, trial: Trial, settings: ControlSettings
+    ) -> Rollout:
         self.control_hook(settings)
         self.controlled.append(settings)
         return make_rollout(inference, settings.controller)

@@ -38,9 +38,8 @@ def test_each_arm_equals_the_reference_panda(side: str, ours: Tree, shared: Call
             mine = base @ ours.pose(f"{side}_{link}", own)
             theirs = reference.pose(link, dict.fromkeys(reference.joints, 0.0) | angles)
             assert np.linalg.norm(mine[:3, 3] - theirs[:3, 3]) < 1e-6, link
-            skew = mine[:3, :3].T @ theirs[:3, :3]
-            angle = 0.5 * np.linalg.norm([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]])
-            assert angle < 1e-6, link
+            # 2 sqrt(2) sin(angle / 2), see `urdf_tree.check_poses`
+            assert np.linalg.norm(mine[:3, :3] - theirs[:3, :3]) / np.sqrt(2) < 1e-6, link
 
 
 def test_the_chains_are_the_tree_and_both_arms_move(ours: Tree) -> None:

@@ -33,7 +33,7 @@ def test_poses_equal_the_reference(robot: str, ours: Tree, shared: Callable[[str
     moving = [name for name, joint in ours.joints.items() if joint.get("type") != "fixed"]
     parents = {Tree.end(joint, "parent") for joint in ours.joints.values()}
     ends = {Tree.end(joint, "child") for name, joint in ours.joints.items() if name not in ADDED[robot]} - parents
-    arm = [Tree.end(ours.joints[name], "child") for name in ROBOTS[robot].joint_names]
+    arm = [Tree.end(ours.joints[name], "child") for side in ROBOTS[robot].arms.values() for name in side.joints]
     check_poses(ours, reference, BASES[robot], sorted({*ends, *arm}), moving)
 
 

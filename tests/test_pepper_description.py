@@ -11,7 +11,9 @@ import trimesh
 from urdf_tree import URDFS, Tree, check_generator, check_joints, check_meshes, check_poses
 
 FOLDER = URDFS / "pepper"
-CHECKED = ("Head", "RElbow", "RForeArm", "r_wrist", "r_gripper", "LForeArm", "l_wrist", "l_gripper", "base_footprint")
+ARM = ("Shoulder", "Bicep", "Elbow", "ForeArm")
+CHECKED = ("Head", "base_footprint", *(side + name for side in "RL" for name in ARM),
+           "r_wrist", "r_gripper", "l_wrist", "l_gripper")  # fmt: skip
 MOVING = ["HeadYaw", "HeadPitch", "HipRoll", "HipPitch", "KneePitch"] + [
     side + name
     for side in "LR"
@@ -32,8 +34,9 @@ def test_poses_equal_the_naoqi_description(ours: Tree, shared: Callable[[str], P
 def test_arm_poses_equal_the_lirmm_description(ours: Tree, shared: Callable[[str], Path]) -> None:
     # Its root is the floor and its torso frame lies lower: compare from the shoulder on.
     reference = Tree(shared("robots/pepper_description/urdf/pepper.urdf"))
-    right = ("RElbow", "RForeArm", "r_wrist", "r_gripper")
-    check_poses(ours, reference, "RShoulder", right, [name for name in MOVING if name.startswith("R")])
+    for side in "RL":
+        links = (f"{side}Bicep", f"{side}Elbow", f"{side}ForeArm", f"{side.lower()}_wrist", f"{side.lower()}_gripper")
+        check_poses(ours, reference, f"{side}Shoulder", links, [name for name in MOVING if name.startswith(side)])
 
 
 def test_joints_equal_the_naoqi_description(ours: Tree, shared: Callable[[str], Path]) -> None:

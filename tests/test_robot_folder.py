@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mild_viz.dashboard.catalog import Catalog
 from mild_viz.data.load import load_dataset
 from mild_viz.errors import UserError
+from mild_viz.paths import checkpoints
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.retarget_arm import MAX_RATE, retarget_arm
 from mild_viz.robot.robots import ROBOTS, find_robot
 from mild_viz.robot.spec import read_spec
+from mild_viz.run_options import RunOptions
 
 LINKS = (("waist", "0 0 0.4", "0 0 1"), ("lift", "0 0 0.1", "0 1 0"), ("twist", "0.15 0 0", "1 0 0"),
          ("bend", "0.2 0 0", "0 1 0"), ("roll", "0.15 0 0", "1 0 0"))  # fmt: skip
@@ -93,6 +96,23 @@ def test_its_kinematics_and_retargeting_work_without_code(crane: Path) -> None:
     assert 0.01 < steps.max() <= MAX_RATE / trial.rate + 1e-9
 
 
+def test_the_whole_pipeline_drives_it_without_code(crane: Path) -> None:
+    """The shipped model of a second human moves it, from a recording to the drawn links."""
+    states = tuple(range(6))  # every frame is adapted by inverse kinematics
+    run = RunOptions(
+        checkpoint=checkpoints() / "nuisi-human", trial=4, robot=str(crane), contact_states=states,
+        placement=(0.9, 0.0, 0.5),
+    )  # fmt: skip
+    rollout, robot = run.run()
+    assert (rollout.robot, robot.title, rollout.contact.all()) == ("crane", "Crane", True)
+    commanded = rollout.joints_commanded
+    assert (commanded >= robot.chain.lower).all() and (commanded <= robot.chain.upper).all()
+    np.testing.assert_allclose(forward(robot.chain, commanded), rollout.end_effector, atol=1e-9)
+    assert np.nanmin(rollout.hand_distance) < 0.03  # by its tip, 0.2 m from the origin of the link
+    assert np.isfinite(rollout.link_poses).all()
+    assert np.ptp(rollout.link_poses[:, robot.link_names.index("roll_link"), 4:], axis=0).max() > 0.05
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
@@ -113,6 +133,11 @@ def test_its_kinematics_and_retargeting_work_without_code(crane: Path) -> None:
         (('elbow = "bend"', 'retarget = "angles"'), "retarget 'angles' is unknown; valid: position, pepper-angles"),
         (('elbow = "bend"', 'mirror_of = "right"'), "mirror_of 'right' is unknown"),
         (('elbow = "bend"', "mirror_signs = [1.0]"), "mirror_signs without mirror_of"),
+        (("[rest]", "[arms.only.position]\nlift = true\n[rest]"), "arms.only.position.lift is True"),
+        (("[rest]", "[arms.only.position]\nlevel_wight = 1\n[rest]"), "did you mean 'level_weight'"),
+        (("[rest]", "[arms.only.position]\nlevel_weight = -1\n[rest]"), "a weight below 0"),
+        (("[rest]", "[arms.only.position]\njoint_weights = [1]\n[rest]"), "expected 5, or none"),
+        (("[rest]", "[arms.only.position]\nelbow_weight = 1\n[rest]"), "lean or rise, with it"),
         (("[arms.only]", "[arms.only"), "is not valid TOML"),
     ],
 )
@@ -123,6 +148,13 @@ def test_a_wrong_entry_is_named(crane: Path, edit: tuple[str, str], message: str
     with pytest.raises(UserError, match="robot.toml|crane.urdf") as caught:
         load_robot(str(crane))
     assert message in str(caught.value)
+
+
+def test_the_chooser_of_the_page_has_it_by_its_title(crane: Path) -> None:
+    assert Catalog(load_robot(str(crane))).robot_titles["crane"] == "Crane"
+    file = crane / "robot.toml"
+    file.write_text(file.read_text().replace('"Crane"', '"Panda"'))
+    assert Catalog(load_robot(str(crane))).robot_titles["crane"] == "Panda (crane)"  # no two of one title
 
 
 def test_what_is_no_robot_is_refused(tmp_path: Path) -> None:

@@ -12,10 +12,9 @@ from scipy.stats import multivariate_normal
 
 from mild_viz.latent.hmm import HMM, forward_filter, log_emission
 from mild_viz.latent.transition import TransitionState, fit_transition_state
-from mild_viz.robot.controller import initial_carry, run_controller
 from mild_viz.robot.model import load_robot
-from mild_viz.robot.stiffness import HANDSHAKE_STIFFNESS
 from mild_viz.settings import ControlSettings
+from tests.controllers import LOW, cut, frames, unhindered
 from tests.models import random_hmm, random_hsmm
 
 REACH, CONTACT, RETURN = 0, 1, 2
@@ -168,8 +167,8 @@ def stiffness(log_alpha: np.ndarray, log_transition: np.ndarray | None, **settin
     n = len(log_alpha)
     chosen = replace(ControlSettings(contact_states=TOUCH), **settings)
     rest, unseen = np.tile(ROBOT.chain.rest, (n, 1)), np.full((n, 3), np.nan)
-    carry = initial_carry(ROBOT.chain)
-    result = run_controller(ROBOT.chain, chosen, "handshake", log_alpha, rest, unseen, carry, log_transition)
+    controller = unhindered(ROBOT.chain, chosen, "handshake", log_alpha.shape[1])
+    result = controller.run(frames(log_alpha, rest, unseen, log_transition), controller.start())
     np.testing.assert_array_equal(result.contact, np.isin(log_alpha.argmax(1), sorted(chosen.contact_states or ())))
     return result.stiffness[:, 0]
 
@@ -178,9 +177,9 @@ def test_the_arm_softens_earlier_by_the_lag(lagging: tuple[np.ndarray, np.ndarra
     log_alpha, log_transition, state = lagging
     assert abs(state.mean[0] - PAUSE) < 0.05
     without, with_state = stiffness(log_alpha, None), stiffness(log_alpha, log_transition)
-    low = without == HANDSHAKE_STIFFNESS
+    low = without == LOW
     np.testing.assert_array_equal(np.flatnonzero(low), np.arange(BEGIN + LAG, BEGIN + LAG + 20))
-    np.testing.assert_array_equal(np.flatnonzero(with_state == HANDSHAKE_STIFFNESS), np.arange(BEGIN, BEGIN + LAG + 20))
+    np.testing.assert_array_equal(np.flatnonzero(with_state == LOW), np.arange(BEGIN, BEGIN + LAG + 20))
 
 
 def log(*values: float) -> np.ndarray:
@@ -193,11 +192,11 @@ def test_no_back_transition_after_the_transition_state() -> None:
     log_alpha[:10] = log(0.9, 0.08, 0.02)
     log_transition = np.full(18, -np.inf)
     log_transition[4] = np.log(0.6)
-    low = np.flatnonzero(stiffness(log_alpha, log_transition) == HANDSHAKE_STIFFNESS)
+    low = np.flatnonzero(stiffness(log_alpha, log_transition) == LOW)
     np.testing.assert_array_equal(low, np.arange(4, 13))
     # where the rest points to the way back rather than to contact, it was a false alarm
     log_alpha[6:10] = log(0.9, 0.02, 0.08)
-    low = np.flatnonzero(stiffness(log_alpha, log_transition) == HANDSHAKE_STIFFNESS)
+    low = np.flatnonzero(stiffness(log_alpha, log_transition) == LOW)
     np.testing.assert_array_equal(low, [4, 5, 10, 11, 12])
 
 
@@ -210,7 +209,7 @@ def test_the_transition_state_speaks_only_before_contact() -> None:
 
 def test_it_must_exceed_what_is_left_for_reaching() -> None:
     log_alpha = np.tile(log(0.5, 0.3, 0.2), (1, 1))
-    for share, expected in ((0.33, 1.0), (0.34, HANDSHAKE_STIFFNESS)):  # p > (1 - p) / 2 from 1/3 on
+    for share, expected in ((0.33, 1.0), (0.34, LOW)):  # p > (1 - p) / 2 from 1/3 on
         assert stiffness(log_alpha, log(share)) == expected
     assert stiffness(log_alpha, log(0.9), contact_states=frozenset()) == 1.0
     assert stiffness(log_alpha, log(0.9), stiffness=False) == 1.0
@@ -232,7 +231,7 @@ def plain_stiffness(log_alpha: np.ndarray, log_transition: np.ndarray, contact_s
         reached = reached or touched or max(shares, key=shares.__getitem__) == tau
         left = {state: share for state, share in shares.items() if state not in visited}
         result.append(reached and max(left, key=left.__getitem__) in contact_states | {tau})
-    return np.where(result, HANDSHAKE_STIFFNESS, 1.0)
+    return np.where(result, LOW, 1.0)
 
 
 def test_stiffness_equals_a_plain_loop_and_a_stream() -> None:
@@ -245,14 +244,11 @@ def test_stiffness_equals_a_plain_loop_and_a_stream() -> None:
         log_alpha, log_transition = np.log(shares / shares.sum(1, keepdims=True)), np.log(rng.beta(0.2, 2.0, size=40))
         expected = plain_stiffness(log_alpha, log_transition, states)
         np.testing.assert_array_equal(stiffness(log_alpha, log_transition, contact_states=states), expected)
-        carry, parts = initial_carry(ROBOT.chain), []
+        controller = unhindered(ROBOT.chain, ControlSettings(contact_states=states), "handshake", 5)
+        whole = frames(log_alpha, np.tile(ROBOT.chain.rest, (40, 1)), np.full((40, 3), np.nan), log_transition)
+        carry, parts = controller.start(), []
         for n in range(40):
-            step = slice(n, n + 1)
-            rest, unseen = ROBOT.chain.rest[None], np.full((1, 3), np.nan)
-            settings = ControlSettings(contact_states=states)
-            part = run_controller(
-                ROBOT.chain, settings, "handshake", log_alpha[step], rest, unseen, carry, log_transition[step]
-            )
+            part = controller.run(cut(whole, slice(n, n + 1)), carry)
             carry = part.carry
             parts.append(part.stiffness[0, 0])
         np.testing.assert_array_equal(parts, expected)

@@ -13,6 +13,7 @@ from mild_viz.checkpoint.model import Checkpoint, RobotInterface
 from mild_viz.errors import UserError
 from mild_viz.latent.context import ContextLayout
 from mild_viz.latent.state_models import STATE_MODELS
+from mild_viz.robot.control.rules import ContactRules, parse_contact_rules, rules_as_json
 from mild_viz.robot.placement import Meeting
 from mild_viz.robot.workspace import Box, Workspace
 from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
@@ -49,6 +50,7 @@ class Config:
     own_models: dict[str, OwnModels]
     contact_states: dict[str, frozenset[int]]
     own_contact_states: dict[str, dict[str, frozenset[int]]]
+    contact_rules: dict[str, ContactRules]
     placement: Placement | None
     meeting: Meeting | None
     workspace: Workspace | None
@@ -80,6 +82,7 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "own_contact_states": {
             variant: states_as_json(table) for variant, table in checkpoint.own_contact_states.items()
         },
+        "contact_rules": rules_as_json(checkpoint.contact_rules),
         "placement": asdict(checkpoint.placement) if checkpoint.placement else None,
         "meeting": asdict(checkpoint.meeting) if checkpoint.meeting else None,
         "workspace": [asdict(box) for box in checkpoint.workspace] if checkpoint.workspace else None,
@@ -273,6 +276,7 @@ def read_config(file: Path) -> Config:
         own_models=own_models,
         contact_states=contact,
         own_contact_states=own_contact,
+        contact_rules=parse_contact_rules(config.get("contact_rules", {}), actions, f"{file}: contact_rules"),
         placement=_placement(config.get("placement"), f"{file}: placement"),
         workspace=_workspace(config.get("workspace"), points, f"{file}: workspace"),
         meeting=_meeting(config.get("meeting"), f"{file}: meeting"),

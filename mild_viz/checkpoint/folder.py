@@ -142,6 +142,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         rate=config.rate,
         contact_states=config.contact_states,
         own_contact_states=config.own_contact_states,
+        contact_rules=config.contact_rules,
         transition_states=parts.transition_states,
         placement=config.placement,
         meeting=config.meeting,

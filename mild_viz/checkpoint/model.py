@@ -15,6 +15,7 @@ from mild_viz.latent.state_models import state_model_of
 from mild_viz.latent.transition import TransitionState
 from mild_viz.latent.vae import VAE
 from mild_viz.robot.chain import ArmChain
+from mild_viz.robot.control.rules import DEFAULT_RULES, ContactRules
 from mild_viz.robot.placement import Meeting
 from mild_viz.robot.workspace import Workspace
 from mild_viz.settings import VARIANTS, Placement, choose
@@ -56,6 +57,8 @@ class Checkpoint:
     """States in which the partners touch, by action, of the shared HMMs."""
     own_contact_states: Mapping[str, Mapping[str, frozenset[int]]] = field(default_factory=dict)
     """The same by variant and action, where a variant has HMMs of its own."""
+    contact_rules: Mapping[str, ContactRules] = field(default_factory=dict)
+    """How the robot behaves in contact, by action; the others follow `DEFAULT_RULES`."""
     transition_states: Mapping[str, TransitionState] = field(default_factory=dict)
     """Where reaching turns into contact, by action, in the latents that the variants share."""
     placement: Placement | None = None
@@ -132,6 +135,10 @@ class Checkpoint:
     def placement_for(self, chain: ArmChain) -> Placement | None:
         """Where the human stands before a robot, as far as the model knows it."""
         return self.placement or (self.meeting and self.meeting.placement(chain))
+
+    def contact_rules_of(self, action: str) -> ContactRules:
+        """How the robot behaves in the contact of an action."""
+        return self.contact_rules.get(action, DEFAULT_RULES[action])
 
     def for_robot(self) -> RobotInterface:
         """The robot interface, or an error if this is a human-human model."""

@@ -12,11 +12,12 @@ from rich.console import Console
 
 from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
+from mild_viz.dashboard.address import is_loopback, page_url
 from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.controls import Controls
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
-from mild_viz.dashboard.server import check_port, is_loopback, open_server, page_url
+from mild_viz.dashboard.server import check_port, open_server
 from mild_viz.dashboard.session import Choice, Pipeline, Session
 from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
@@ -24,9 +25,10 @@ from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
-from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import CONTROLLERS_OF, ControlSettings, InferSettings, choose
-from mild_viz.trial import Dataset, Trial
+from mild_viz.robot.source import RobotSource
+from mild_viz.rollout import Rollout
+from mild_viz.settings import CONTROLLERS_OF, InferSettings, choose
+from mild_viz.trial import Dataset
 
 LABEL = "mild_viz"
 
@@ -39,7 +41,6 @@ class Dashboard:
     ) -> None:
         self.server = open_server(host, port, LABEL)
         self.url = page_url(host, port)
-        self.robot = robot
         self._dark: bool | None = None
         self._set_theme(False)
         self.scene = Scene(self.server, robot, dark=False)
@@ -49,7 +50,7 @@ class Dashboard:
             self._write_html, self._write_csv,
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
-        stages = Pipeline(self._infer, self._control)
+        stages = Pipeline(pipeline.infer, pipeline.control)
         self.session = Session(self.controls.read, stages, self._show, self.controls.report)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
         self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
@@ -62,20 +63,15 @@ class Dashboard:
         self.session.close()
         self.server.stop()
 
-    def _infer(self, checkpoint: Checkpoint, trial: Trial, variant: str) -> Inference:
-        return pipeline.infer(checkpoint, trial, variant, self.robot)
-
-    def _control(self, inference, checkpoint: Checkpoint, trial: Trial, settings: ControlSettings) -> Rollout:
-        return pipeline.control(inference, checkpoint, self.robot, trial, settings)
-
     def _show(self, rollout: Rollout, choice: Choice, is_new: bool) -> None:
         """Called by the session's worker with every new rollout or view."""
         self._set_theme(choice.view.dark)
+        self.scene.set_robot(choice.robot)
         compared = self._compare(rollout, choice)
         self.scene.show(rollout, choice.view, compared)
         before = self.session.choice
-        restart = before is None or before.trial is not choice.trial
-        control, chain = choice.settings.control, self.robot.chain
+        restart = before is None or before.trial is not choice.trial or before.robot is not choice.robot
+        control, chain = choice.settings.control, choice.robot.chain
         figures = [controller_figures(one, chain, control.lambda_x, control.lambda_q) for one in compared]
         self.controls.show(rollout, choice, figures)
         self.timeline.show(rollout, choice.view.alpha_mode)
@@ -89,7 +85,7 @@ class Dashboard:
         """The rollouts of the compared controllers; a few milliseconds each, in the session's worker."""
         known, settings = CONTROLLERS_OF[choice.checkpoint.decodes], choice.settings.control
         compared = tuple(name for name in choice.view.compared if name in known)
-        return run_controllers(rollout.inference, choice.checkpoint, self.robot, choice.trial, settings, compared)
+        return run_controllers(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings, compared)
 
     def _tick(self, frame: int, playing: bool) -> None:
         self.timeline.tick(frame, playing)
@@ -111,7 +107,8 @@ class Dashboard:
         from mild_viz.dashboard import recorder  # only a recording needs it
 
         assert self.session.rollout is not None and self.session.choice is not None
-        recorder.record_html(self.session.rollout, self.robot, self.session.choice.view, path)
+        choice = self.session.choice
+        recorder.record_html(self.session.rollout, choice.robot, choice.view, path)
 
     def _write_csv(self, path: Path) -> None:
         from mild_viz.dashboard import recorder
@@ -155,6 +152,7 @@ def open_dashboard(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Dashboard:
@@ -169,11 +167,12 @@ def open_dashboard(
     recordings = load_dataset(dataset)
     folder = checkpoint or paths.default_checkpoint(dataset)
     model = load_checkpoint(folder)
-    arm = open_robot(model, robot)
-    catalog = Catalog(arm, folder)
+    arm = open_robot(model, robot, robot_source)
+    catalog = Catalog(arm, folder, robot_source)
+    shown = catalog.robot_name
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
-    problem = catalog.problem(name, dataset)
+    problem = catalog.problem(name, dataset, shown)
     if problem is not None:
         raise UserError(problem)
     return Dashboard(host, port, catalog, arm, name, first)
@@ -186,12 +185,13 @@ def run(
     trial: int | None = None,
     variant: str | None = None,
     robot: str | None = None,
+    robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
 ) -> None:
     """Start the page and serve it until Ctrl-C."""
-    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, host, port)
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port)
     console = Console()
     console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
     if not is_loopback(host):

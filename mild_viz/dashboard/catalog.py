@@ -10,19 +10,26 @@ from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from mild_viz.data.load import DATASETS, data_root, load_dataset, missing_files
 from mild_viz.decoding import decoding_of
 from mild_viz.errors import UserError
-from mild_viz.robot.model import RobotModel
-from mild_viz.robot.robots import robot_title
+from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.robots import ROBOTS, robot_of
+from mild_viz.robot.source import RobotSource
+from mild_viz.settings import choose
 from mild_viz.trial import Dataset, Trial
 
 
 class Catalog:
-    """Datasets and models by name. Each is read when it is first asked for, and then kept."""
+    """Datasets, models and robots by name. Each is read when it is first asked for, and then kept."""
 
-    def __init__(self, robot: RobotModel, chosen: Path | None = None) -> None:
-        self._robot = robot
+    def __init__(self, robot: RobotModel, chosen: Path | None = None, source: RobotSource = "own") -> None:
+        known = ROBOTS.get(robot.name)
+        # another description of a robot that is known by name has its file for a name
+        self.robot_name = robot.name if known is None or known.urdf == robot.spec.urdf else str(robot.spec.urdf)
+        """Name on the page of the robot that is shown first."""
+        self._robots = {self.robot_name: robot}
         self._checkpoints: dict[Path, Checkpoint] = {}
-        self._problems: dict[tuple[str, str], str | None] = {}
+        self._problems: dict[tuple[str, str, str], str | None] = {}
         self.chosen = None if chosen is None else chosen.resolve()
+        self._source: RobotSource = source
 
     @cached_property
     def model_paths(self) -> dict[str, Path]:
@@ -51,6 +58,19 @@ class Catalog:
         present = self.present()
         return tuple(name for name in DATASETS if name not in present)
 
+    @cached_property
+    def robot_titles(self) -> dict[str, str]:
+        """The robots by their names here, and what they are called on the page."""
+        others = {name: spec.title for name, spec in ROBOTS.items() if name != self.robot_name}
+        title = self._robots[self.robot_name].title  # its own folder's, which ROBOTS may not know
+        return {self.robot_name: f"{title} ({self.robot_name})" if title in others.values() else title, **others}
+
+    def robot(self, name: str) -> RobotModel:
+        """The robot of that name."""
+        if name not in self._robots:
+            self._robots[name] = load_robot(choose("robot", name, list(self.robot_titles)), source=self._source)
+        return self._robots[name]
+
     def dataset(self, name: str) -> Dataset:
         return load_dataset(name)
 
@@ -71,18 +91,18 @@ class Catalog:
         """Use this one from now on: its default contact states were changed."""
         self._checkpoints[checkpoint.path.resolve()] = checkpoint
 
-    def problem(self, model: str, dataset: str) -> str | None:
-        """Why a model cannot be used on a dataset with this robot; None if it can."""
-        key = (model, dataset)
+    def problem(self, model: str, dataset: str, robot: str) -> str | None:
+        """Why a model cannot be used on a dataset with a robot; None if it can."""
+        key = (model, dataset, robot)
         if key not in self._problems:
-            self._problems[key] = self._find_problem(model, dataset)
+            self._problems[key] = self._find_problem(*key)
         return self._problems[key]
 
-    def _find_problem(self, model: str, dataset: str) -> str | None:
+    def _find_problem(self, model: str, dataset: str, robot: str) -> str | None:
         try:
             checkpoint, recordings = self.checkpoint(model), self.dataset(dataset)
             trials = recordings.train + recordings.test
-            decoding_of(checkpoint, self._robot, trials[0].rate)
+            decoding_of(checkpoint, self.robot(robot), trials[0].rate)
         except UserError as error:
             return str(error)
         if not set(checkpoint.actions) & set(recordings.actions):
@@ -101,9 +121,9 @@ class Catalog:
             )
         return None
 
-    def models(self, dataset: str) -> tuple[str, ...]:
-        """The models that can be used on a dataset, those made for it first."""
-        fitting = [model for model in self.model_paths if self.problem(model, dataset) is None]
+    def models(self, dataset: str, robot: str) -> tuple[str, ...]:
+        """The models that can be used on a dataset with a robot, those made for it first."""
+        fitting = [model for model in self.model_paths if self.problem(model, dataset, robot) is None]
         return tuple(sorted(fitting, key=lambda model: self._rank(model, dataset)))
 
     def _rank(self, model: str, dataset: str) -> tuple[bool, bool, bool, str]:
@@ -120,19 +140,22 @@ class Catalog:
             except UserError as error:
                 others[name] = str(error)
                 continue
-            if self.models(name):
+            if self.robot_for(name, self.robot_name) is not None:
                 usable.append(name)
             else:
-                others[name] = self._how_else(name)
+                others[name] = "no model here fits it"
         return tuple(usable), others
 
-    def _how_else(self, dataset: str) -> str:
-        """A page shows one robot: where the dataset's own model drives another, how to open that."""
-        model = paths.SHIPPED_MODELS.get(dataset)
-        robot = self.checkpoint(model).robot if model in self.model_paths else None
-        if robot is None or robot.joint_names == self._robot.chain.joint_names:
-            return "no model here fits it"
-        return f"it has another robot, {robot_title(robot.name)}; open it with: mild-viz app --dataset {dataset}"
+    def robot_for(self, dataset: str, robot: str) -> str | None:
+        """`robot` if a model drives it on this dataset, else the one that the dataset's models are made for, if any."""
+        names = dict.fromkeys([robot, robot_of(dataset), *self.robot_titles])
+        return next((name for name in names if name in self.robot_titles and self.models(dataset, name)), None)
+
+    def dataset_for(self, robot: str, dataset: str) -> str | None:
+        """`dataset` if a model drives this robot on it, else the robot's own, else any that is here; None without."""
+        own = [name for name in self.present() if robot_of(name) == robot]
+        names = dict.fromkeys([dataset, *own, *self.present()])
+        return next((name for name in names if self.models(name, robot)), None)
 
     def actions(self, model: str, dataset: str) -> tuple[str, ...]:
         """The interactions that both know."""

@@ -68,11 +68,11 @@ class Controls:
 
     def read(self) -> Choice:
         """What the widgets say, checked. Raises UserError naming the widget."""
-        infer, checkpoint, trial = self._trial.read()
+        infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, contact_states)
         view = replace(self._view.read(), compared=self._compare.read())
-        return Choice(Settings(infer, control), view, checkpoint, trial)
+        return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 
     def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:
         """Follow a new rollout, and the figures of the controllers that are compared on its trial."""

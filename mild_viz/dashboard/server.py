@@ -6,7 +6,6 @@ import contextlib
 import errno
 import functools
 import io
-import ipaddress
 import socket
 from collections.abc import Iterator
 
@@ -14,25 +13,10 @@ import viser
 import viser._messages
 import websockets.asyncio.server
 
+from mild_viz.dashboard.address import is_loopback
 from mild_viz.errors import UserError
 
 PORTS_TRIED = 200
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def page_url(host: str, port: int) -> str:
-    """Where a browser on this machine finds the page. An address that stands for all is replaced by one of them."""
-    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
 def _can_bind(host: str, port: int) -> bool:

@@ -12,13 +12,13 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.view import ViewSettings
 from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import Settings
+from mild_viz.settings import ControlSettings, Settings
 from mild_viz.trial import Trial
 
 log = logging.getLogger(__name__)
@@ -33,18 +33,21 @@ class Choice:
     checkpoint: Checkpoint
     """Compared by identity: a checkpoint is loaded once."""
     trial: Trial
+    robot: RobotModel
+    """Compared by identity: a robot is loaded once."""
 
     def same_inference(self, other: Choice) -> bool:
-        """Whether `infer` would give the same: model, variant and trial."""
-        return self.settings.infer == other.settings.infer and self.checkpoint.human_vae is other.checkpoint.human_vae
+        """Whether `infer` would give the same: model, variant, trial and robot."""
+        same_model = self.checkpoint.human_vae is other.checkpoint.human_vae and self.robot is other.robot
+        return self.settings.infer == other.settings.infer and same_model
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """The two stages that a session reruns (`mild_viz.pipeline`, with the robot filled in)."""
+    """The two stages that a session reruns: those of `mild_viz.pipeline`."""
 
-    infer: Callable[[Checkpoint, Trial, str], Inference]
-    control: Callable[[Inference, Checkpoint, Trial, Any], Rollout]
+    infer: Callable[[Checkpoint, Trial, str, RobotModel], Inference]
+    control: Callable[[Inference, Checkpoint, RobotModel, Trial, ControlSettings], Rollout]
 
 
 class Session:
@@ -140,7 +143,9 @@ class Session:
         is_new = rollout is None or inference is not rollout.inference
         if is_new or shown is None or rollout is None or choice.settings.control != shown.settings.control:
             self.n_control += 1
-            rollout = self._pipeline.control(inference, choice.checkpoint, choice.trial, choice.settings.control)
+            rollout = self._pipeline.control(
+                inference, choice.checkpoint, choice.robot, choice.trial, choice.settings.control
+            )
         elif choice.view == shown.view:
             return
         self._show(rollout, choice, is_new)
@@ -152,7 +157,9 @@ class Session:
         """Infer for the latest choice: what was chosen in the meantime decides the control that follows."""
         while True:
             self.n_infer += 1
-            inference = self._pipeline.infer(choice.checkpoint, choice.trial, choice.settings.infer.variant)
+            inference = self._pipeline.infer(
+                choice.checkpoint, choice.trial, choice.settings.infer.variant, choice.robot
+            )
             if not self._dirty.is_set() or self._closed:
                 return inference, choice
             self._dirty.clear()

@@ -13,11 +13,11 @@ from jaxtyping import Float
 
 from mild_viz import streaming
 from mild_viz.live.config import LiveConfig
-from mild_viz.live.idle import idle
 from mild_viz.live.messages import Observation
 from mild_viz.live.onset import CALIBRATING, INTERACTING, RETURNING, WAITING, PhaseTracker
 from mild_viz.live.pace import Clock, Pace
 from mild_viz.live.person import Body
+from mild_viz.robot.control.rules import GONE, MISSING
 from mild_viz.streaming import Command, StreamModel
 
 Arm = Float[np.ndarray, "3 3"]
@@ -38,8 +38,6 @@ class Counts:
     """A command was made of it; of a tracker faster than the model, only every second or third frame asks for one."""
     stale: int = 0
     """Too old when their turn came."""
-    implausible: int = 0
-    """With a joint that moved too fast."""
     untracked: int = 0
     """Without a whole arm."""
     held: int = 0
@@ -60,6 +58,8 @@ class Decision:
     """Whether it answers an observation."""
     note: str = ""
     """Why the robot holds or returns, for people."""
+    T_world_person: Float[np.ndarray, "4 4"] | None = None
+    """The person's frame, where it had to be found in positions given in world."""
 
 
 @dataclass
@@ -79,10 +79,12 @@ class LiveController:
         self.interaction = 0
         self.trouble = ""
         """Why no interaction can begin; empty where one can."""
-        self._pace = Pace(self.model.rate, config.bridge, config.gone)
+        self._pace = Pace(self.model.rate, config.bridge, config.gone_after)
         self._lead: deque[Arm] = deque(maxlen=config.lead_frames(self.model.rate))
         self._references: deque[Float[np.ndarray, "4 3"]] = deque(maxlen=REFERENCES)
         self._last: tuple[float, Arm] | None = None
+        self._commanded: float | None = None
+        """When the last command was made [s]."""
         self._usable = -np.inf
 
     @property
@@ -98,12 +100,11 @@ class LiveController:
             return None
         time = self.clock.time(seen.timestamp, seen.received)
         arm, reference = self.body.read(seen)
-        arm = self._plausible(time, arm)
         if np.isfinite(arm).all():
             self._usable = now
         else:
             self.counts.untracked += 1
-        if self._last is not None and time - self._last[0] > self.config.gone:
+        if self._last is not None and time - self._last[0] > self.config.gone_after:
             self._leave()
         self._last = (time, arm)
         self._references.append(reference)
@@ -114,22 +115,22 @@ class LiveController:
         self._give_up(now)
         phase = self.tracker.update(time, arm[2])
         if before == WAITING and phase == INTERACTING:
-            return self._begin()
+            return self._begin(now)
         if not samples:
             return None
         self.counts.answered += 1
         if phase == INTERACTING:
-            return self._respond([self.body.to_person(sample) for sample in samples])
-        return self._rest(answers=True)
+            return self._respond(now, [self.body.to_person(sample) for sample in samples])
+        return self._rest(now, answers=True)
 
     def tick(self, now: float) -> Decision:
         """Decide without an observation, because none came in time."""
         self.counts.held += 1
         self._give_up(now)
         if self.tracker.phase != INTERACTING:
-            return self._rest(answers=False)
-        self.carry, command = idle(self.model, self.carry, now - self._usable)
-        return self._decide(command, (), False, "no usable observation")
+            return self._rest(now, answers=False)
+        self.carry, command = streaming.idle(self.model, self.carry, self._elapsed(now))
+        return self._decide(now, command, (), False, "no frame came")
 
     def stop(self) -> None:
         """End the interaction, because the program ends."""
@@ -138,22 +139,12 @@ class LiveController:
     @property
     def at_rest(self) -> bool:
         """Whether the last command was the resting posture."""
-        joints, rest = self.carry.control.joints, self.model.robot.chain.rest
+        joints, rest = self.carry.control.joints, self.model.controller.limits.rest
         return bool(np.abs(joints - rest).max() <= AT_REST)
-
-    def _plausible(self, time: float, arm: Arm) -> Arm:
-        """The arm; NaN if a joint of it cannot have come there since the last one that was believed."""
-        if self._last is None or not np.isfinite(self._last[1]).all():
-            return arm
-        way = float(np.linalg.norm(arm - self._last[1], axis=1).max())
-        if not way > self.config.jump * (time - self._last[0]):
-            return arm
-        self.counts.implausible += 1
-        return np.full((3, 3), np.nan)
 
     def _give_up(self, now: float) -> None:
         """End the interaction, or the waiting, with a person who is gone."""
-        if now - self._usable > self.config.gone:
+        if now - self._usable > self.config.gone_after:
             self._leave()
 
     def _leave(self) -> None:
@@ -163,41 +154,52 @@ class LiveController:
         if self.tracker.phase == CALIBRATING:
             self._lead.clear()
 
-    def _begin(self) -> Decision:
+    def _begin(self, now: float) -> Decision:
         """Start the model some frames before the start, as it began in training."""
+        self.counts.answered += 1
         if not self.body.place(np.array(self._references)):
             self.tracker.forget()
             self.trouble = (
                 "positions are in 'world' coordinates: the person's own frame needs both shoulders, the waist or "
                 "pelvis, and the collar or neck"
             )
-            return self._rest(answers=True)
+            return self._rest(now, answers=True)
         self.trouble = ""
         self.interaction += 1
-        self.counts.answered += 1
         self.carry = streaming.start(self.model)._replace(control=self.carry.control)
-        return self._respond([self.body.to_person(arm) for arm in self._lead], moves=1)
+        return self._respond(now, [self.body.to_person(arm) for arm in self._lead])
 
-    def _respond(self, samples: list[Arm], moves: int | None = None) -> Decision:
-        """Take samples; of several, those that the robot had no time to follow move the model alone."""
-        command = None
-        for left, arm in zip(range(len(samples), 0, -1), samples, strict=True):
+    def _respond(self, now: float, samples: list[Arm]) -> Decision:
+        """Take samples. The last one makes the command; those before it move the model alone, since the robot had no
+        time to follow them."""
+        seconds = self._elapsed(now)
+        for arm in samples[:-1]:
             before = self.carry.control
-            self.carry, command = streaming.step(self.model, self.carry, arm)
-            follows = left <= moves if moves is not None else bool(np.isfinite(arm).all()) or left == 1
-            if not follows:
-                self.carry = self.carry._replace(control=self.carry.control._replace(joints=before.joints))
-        if command is None:  # the first window is not full yet
-            self.carry, command = idle(self.model, self.carry, 0.0)
-        return self._decide(command, tuple(samples), True, "")
+            self.carry, _ = streaming.step(self.model, self.carry, arm)
+            self.carry = self.carry._replace(control=self.carry.control.paused(before))
+        self.carry, command = streaming.step(self.model, self.carry, samples[-1], seconds)
+        assert command is not None, "the lead fills the first window"
+        return self._decide(now, command, tuple(samples), True)
 
-    def _rest(self, answers: bool) -> Decision:
+    def _rest(self, now: float, answers: bool) -> Decision:
         """Bring the arm back to rest, or keep it there."""
-        self.carry, command = idle(self.model, self.carry, np.inf)
-        decision = self._decide(command, (), answers, self.tracker.reason if self.tracker.phase == RETURNING else "")
+        self.carry = self.carry._replace(control=self.carry.control.dismissed())
+        self.carry, command = streaming.idle(self.model, self.carry, self._elapsed(now))
+        if now - self._usable <= self.config.gone_after:  # sent to rest, but not because nobody is there
+            command = command._replace(fired=command.fired & ~(1 << MISSING | 1 << GONE))
+        note = self.tracker.reason if self.tracker.phase == RETURNING else ""
+        decision = self._decide(now, command, (), answers, note)
         if self.at_rest:
             self.tracker.rested()
         return decision
 
-    def _decide(self, command: Command, samples: tuple[Arm, ...], answers: bool, note: str) -> Decision:
-        return Decision(self.tracker.phase, self.interaction, command, samples, answers, note)
+    def _elapsed(self, now: float) -> float:
+        """Time since the last command [s]; a period before the first."""
+        return 1.0 / self.model.rate if self._commanded is None else now - self._commanded
+
+    def _decide(
+        self, now: float, command: Command, samples: tuple[Arm, ...], answers: bool, note: str = ""
+    ) -> Decision:
+        self._commanded = now
+        found = self.body.T_world_person if self.body.coordinates == "world" else None
+        return Decision(self.tracker.phase, self.interaction, command, samples, answers, note, found)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +22,7 @@ from mild_viz.live.latency import Latency
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
 from mild_viz.live.outputs import Output
+from mild_viz.robot.control.rules import fired_rules
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +41,7 @@ class Tick:
     """What happened in one turn of the loop."""
 
     time: float
-    """Since the loop began [s]: what the decision was made at."""
+    """`time.perf_counter()` [s]: what the decision was made at."""
     seen: Observation | None
     decision: Decision | None
     sent: JointCommand | None
@@ -49,10 +52,8 @@ class Tick:
     fault: str = ""
 
 
-class Witness(Protocol):
-    """Whoever is told of every tick, in the control thread: must neither wait nor raise."""
-
-    def __call__(self, tick: Tick) -> None: ...
+Witness = Callable[[Tick], None]
+"""Whoever is told of every tick, in the control thread: must neither wait nor raise."""
 
 
 @dataclass
@@ -67,22 +68,22 @@ class LiveLoop:
     latency: Latency = field(default_factory=Latency)
     faults: int = 0
     last_fault: str = ""
-    _sequence: int = 0
-    _began: float = 0.0
+    sent: int = 0
+    """Commands that left; the last one's sequence number."""
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> None:
         """Control until stopped, until the input ends, or for so long [s]; then bring the arm back to rest."""
         config, period = self.controller.config, 1.0 / self.controller.model.rate
-        self._began = time.perf_counter()
         # A frame may be late: a command without one comes only when it is missed.
         patience = max(config.bridge, 1.5 * period)
-        due = self._began + patience
         ending: float | None = None
         with steady():
+            began = time.perf_counter()
+            due = began + patience
             while True:
                 now = time.perf_counter()
                 if ending is None and (
-                    stopped() or self.source.finished or (duration is not None and now - self._began >= duration)
+                    stopped() or self.source.finished or (duration is not None and now - began >= duration)
                 ):
                     ending = now
                     self._safely(self.controller.stop)
@@ -110,15 +111,14 @@ class LiveLoop:
     def _turn(self, seen: Observation | None, now: float) -> bool:
         """One decision and what follows from it; whether a command was sent."""
         decision, fault = None, ""
-        clock = now - self._began
         try:
             controller = self.controller
-            decision = controller.tick(clock) if seen is None else controller.observe(self._on_clock(seen), clock)
+            decision = controller.tick(now) if seen is None else controller.observe(seen, now)
         except Exception as error:
             fault = self._note(error)
         sent = None
         if decision is not None or fault:
-            sent = self._command(seen, decision, clock)
+            sent = self._command(seen, decision, now)
             try:
                 self.output.send(sent)
             except Exception as error:  # an output must not, but a robot must not pay for it
@@ -128,7 +128,7 @@ class LiveLoop:
         if seen is not None and sent is not None:
             whole = done - seen.received
             self.latency.add(done - now, whole)
-        tick = Tick(clock, seen, decision, sent, done - now, whole, fault)
+        tick = Tick(now, seen, decision, sent, done - now, whole, fault)
         for witness in self.witnesses:
             try:
                 witness(tick)
@@ -136,11 +136,7 @@ class LiveLoop:
                 self._note(error)
         return sent is not None
 
-    def _on_clock(self, seen: Observation) -> Observation:
-        """The observation with its arrival on the loop's own clock, so that a recorded one can be run again."""
-        return Observation(**{**vars(seen), "received": seen.received - self._began})
-
-    def _command(self, seen: Observation | None, decision: Decision | None, clock: float) -> JointCommand:
+    def _command(self, seen: Observation | None, decision: Decision | None, now: float) -> JointCommand:
         """The command that leaves: as decided and checked, or the last one again."""
         last, stiff = self.guard.last, np.ones(len(self.guard.last))
         phase, contact, fired = self.controller.tracker.phase, False, (FAULT,)
@@ -148,12 +144,16 @@ class LiveLoop:
         if decision is not None:
             command = decision.command
             positions, stiff = command.joints_commanded, command.stiffness
-            phase, contact, fired = decision.phase, command.contact, fired_names(decision)
-        positions, stiff = self.guard.check(positions, stiff, clock)
-        self._sequence += 1
+            phase, contact, fired = (
+                decision.phase,
+                command.contact,
+                tuple(rule.name for rule in fired_rules(command.fired)),
+            )
+        positions, stiff = self.guard.check(positions, stiff, now)
+        self.sent += 1
         return JointCommand(
             timestamp=time.time(),
-            sequence=self._sequence,
+            sequence=self.sent,
             observed=None if seen is None or fired == (FAULT,) else seen.timestamp,
             joint_names=self.controller.model.robot.chain.joint_names,
             positions=positions,
@@ -177,11 +177,6 @@ class LiveLoop:
         return self.last_fault
 
 
-def fired_names(decision: Decision) -> tuple[str, ...]:
-    """Names of the rules that decided a command."""
-    return ("hold",) if not decision.answers and decision.phase == INTERACTING else ()
-
-
 _collected = False
 
 
@@ -195,14 +190,37 @@ def tidy(phase: str) -> None:
         gc.collect()
 
 
+SWITCH = 5e-4
+"""For how long another thread of this process may keep the interpreter while the control thread wants it [s]."""
+
+PRIORITY = -10
+"""Of the control thread, where the system lets us raise it (root, or a limit that an administrator set)."""
+
+
 @contextmanager
 def steady() -> Iterator[None]:
-    """No garbage collection of its own accord: what is loaded is put aside for good, so that a collection is short."""
+    """As few pauses as possible: no garbage collection of its own accord (what is loaded is put aside for good, so that
+    a collection is short), short turns of other threads, and priority where it is granted."""
     gc.collect()
     gc.freeze()
     gc.disable()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH)
+    priority = _priority()
+    _set_priority(PRIORITY)
     try:
         yield
     finally:
+        _set_priority(priority)
+        sys.setswitchinterval(interval)
         gc.enable()
         gc.unfreeze()
+
+
+def _priority() -> int:
+    return os.getpriority(os.PRIO_PROCESS, 0) if hasattr(os, "getpriority") else 0
+
+
+def _set_priority(value: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, 0, value)  # on Linux of this thread alone

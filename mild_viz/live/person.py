@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from mild_viz.data.skeletons import ARM_JOINTS, joint_indices, person_frame, to_frame
+from mild_viz.data.demo_body import DEMO_BONES, DEMO_JOINTS
+from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, joint_indices, person_frame, to_frame
 from mild_viz.errors import UserError
 from mild_viz.live.messages import Observation
 
@@ -58,3 +59,13 @@ class Body:
         if self.coordinates == "person":
             return points
         return np.full_like(points, np.nan) if self.T_world_person is None else to_frame(self.T_world_person, points)
+
+
+def skeleton_bones(names: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    """Bones between the joints of a frame, by their names; none where too little was sent to draw a body."""
+    if not {"left_shoulder", "right_shoulder"} <= set(names):
+        return ()
+    # The demo set's joints are Nuitrack's, and legs.
+    joints, bones = (ZED_JOINTS, ZED_BONES) if "pelvis" in names else (DEMO_JOINTS, DEMO_BONES)
+    between = [(joints[a], joints[b]) for a, b in bones]
+    return tuple((names.index(a), names.index(b)) for a, b in between if a in names and b in names)

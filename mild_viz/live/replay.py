@@ -15,14 +15,15 @@ from mild_viz.live.inputs import Input
 from mild_viz.live.messages import JOINTS, Observation
 from mild_viz.trial import Trial
 
-OPTIONS = ("rate", "speed", "loop")
+OPTIONS = ("rate", "speed", "loop", "rest")
 
 
 class ReplayInput(Input):
     """The person of one trial, in the person's own frame; the clock starts at the first `poll`.
 
     Timestamps are seconds since then. `rate` [Hz] samples the recorded motion anew (linearly, lost where either
-    neighbour is); `speed` makes it faster; `loop` starts it over at its end, without a pause.
+    neighbour is); `speed` makes it faster; `loop` starts it over at its end, without a pause. `rest` [s] holds the
+    first frame so long before: recordings may begin with the reach, while a person who is met stands there first.
     """
 
     def __init__(self, address: Address) -> None:
@@ -35,6 +36,10 @@ class ReplayInput(Input):
         self._loop = address.choice("loop", ("0", "1")) == "1"
         self._names, body = recorded_joints(trial)
         self._frames = _sampled(body, trial.rate * speed / self._rate)
+        n_rest = round(address.number("rest", 0.0, 0.0, 60.0) * self._rate)
+        if n_rest:
+            first = self._frames[int(np.isfinite(self._frames).all((1, 2)).argmax())]
+            self._frames = np.concatenate([np.repeat(first[None], n_rest, axis=0), self._frames])
         self._next = 0
         self._start: float | None = None
         self._closed = threading.Event()

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.description import TURNING, Description, Joint
+from mild_viz.robot.position_rule import PositionRule
 from mild_viz.trial import freeze_arrays
 
 FOLD_VERSION = 2
@@ -48,6 +49,10 @@ class ArmChain:
     """Where the joints stand when nothing moves them [rad]."""
     offsets: Float[np.ndarray, "_ 4 4"]
     axes: Float[np.ndarray, "J 3"]
+    elbow: str | None = None
+    """Joint whose origin is the elbow."""
+    position: PositionRule = PositionRule()
+    """How it takes over a person's posture."""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

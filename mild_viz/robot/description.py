@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,6 +84,11 @@ class Description:
     urdf: yourdfpy.URDF
     """The parse that the visuals are loaded from (without meshes)."""
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """All links, the root first."""
+        return (self.root, *(joint.child for joint in self.joints))
+
     def joint(self, name: str) -> Joint:
         """The joint of that name; `UserError` listing the joints that turn where there is none."""
         for joint in self.joints:
@@ -94,9 +99,15 @@ class Description:
 
     def require_link(self, name: str) -> None:
         """`UserError` listing the links where there is none of that name."""
-        links = (self.root, *(joint.child for joint in self.joints))
-        if name not in links:
-            raise UserError(f"{self.path} has no link '{name}'; it has: {', '.join(links)}")
+        if name not in self.links:
+            raise UserError(f"{self.path} has no link '{name}'; it has: {', '.join(self.links)}")
+
+    def placed(self, pose: Float[np.ndarray, "4 4"]) -> Description:
+        """The same robot, whose root stands at `pose` in a new base frame."""
+        base = f"{max(self.links, key=len)}_base"  # longer than every name that there is
+        axis = np.array([1.0, 0.0, 0.0])
+        fixed = Joint(f"{base}_joint", "fixed", base, self.root, pose, axis, -np.inf, np.inf, np.inf, None)
+        return replace(self, root=base, joints=(fixed, *self.joints))
 
     def path_to(self, link: str) -> tuple[Joint, ...]:
         """Joints from the root to a link."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mild_viz.robot.chain import ArmChain, kernel_array
 from mild_viz.robot.objective.terms import IKTerms
-
-NO_TERMS = IKTerms()
 
 
 def solve_ik(
@@ -36,16 +36,18 @@ def solve_ik(
     """
     from mild_viz.robot.kernels import solve_ik_batch
 
-    terms = terms or NO_TERMS
+    asked = _no_terms(chain.n_joints) if terms is None else (terms.packed(chain, len(targets)), *terms.steps(chain))
     return solve_ik_batch(
-        chain.arm,
-        kernel_array(targets),
-        kernel_array(priors),
-        float(lambda_x),
-        float(lambda_q),
-        terms.packed(chain, len(targets)),
-        *terms.steps(chain),
+        chain.arm, kernel_array(targets), kernel_array(priors), float(lambda_x), float(lambda_q), *asked
     )
+
+
+@cache
+def _no_terms(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the kernel takes where there are no terms: made once, because it takes as long as a third of the solving."""
+    from mild_viz.robot.objective.kernels import plain_terms
+
+    return plain_terms(n)[None], np.full(n, np.inf), np.full(n, np.nan)
 
 
 def unreachable(

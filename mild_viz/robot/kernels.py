@@ -1,9 +1,9 @@
-"""Compiled kernels of inverse kinematics with a joint prior, and of the control loop.
+"""Compiled kernels of inverse kinematics with a joint prior.
 
-They work on plain float64 arrays; an arm is laid out as `kinematics.kernels` says. The typed wrappers are
-`ik` and `controller`. Kernels that call each other are kept together where possible, because numba's cache
-notices changes only in a function's own file: after a change in kinematics/kernels.py or objective/kernels.py, remove
-__pycache__ here.
+They work on plain float64 arrays; an arm is laid out as `kinematics.kernels` says. The typed wrappers are in `ik`.
+Kernels that call each other are kept together where possible, because numba's cache notices changes only in a
+function's own file: after a change in kinematics/kernels.py or objective/kernels.py, remove __pycache__ here; after one
+here, that of control/.
 """
 
 import math
@@ -13,15 +13,6 @@ from numba import njit
 
 from mild_viz.robot.kinematics.kernels import LOWER, UPPER, arm_forward
 from mild_viz.robot.objective.kernels import ELBOW, JOINT_WEIGHTS, TURN, derivatives, objective, plain_terms
-
-BASE_IK, MILD, MILD_IK = 0, 1, 2
-"""Controllers, in the order of `settings.CONTROLLERS`."""
-
-STARTED, PROGRESS, VISITED = 0, 1, 2
-"""Slots of the carry's flags: a command was sent; how far it went; bit mask of the states seen before contact."""
-
-REACHING, CROSSING, TOUCHING = 0, 1, 2
-"""How far an interaction went: before contact; the transition state was entered; a contact state was active."""
 
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-10
@@ -92,7 +83,7 @@ def _bounded_step(arm, hessian, damping, gradient, q, step, fixed, factor, rhs):
 
 
 @njit(cache=True, fastmath=False)
-def _copy(source, into):
+def copy_into(source, into):
     """Slice assignment, which numba takes seconds to compile."""
     for i in range(into.shape[0]):
         into[i] = source[i]
@@ -157,8 +148,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, q, scratch):
                 damping, growth = max(damping * growth, 1e-3 * scale), 2.0 * growth
         if not improved or still:
             break
-        _copy(candidate, q)
-        _copy(moved, position)
+        copy_into(candidate, q)
+        copy_into(moved, position)
         cost = new_cost
     # The objective is flat to rounding here, the gradient is not: one more Newton step squares what is left, so that
     # inputs that differ by rounding give the same solution to rounding. Where the arm can turn freely about its
@@ -223,66 +214,3 @@ def unreachable_batch(arm, targets, solutions, tolerance):
     for k in range(n):
         flags[k] = unreachable_one(arm, targets[k], solutions[k], tolerance, spare, scratch)
     return flags
-
-
-@njit(cache=True, fastmath=False)
-def _argmax(values, excluded):
-    """Index of the largest value whose bit is not set in `excluded`; the first one where they are equal."""
-    best = -1
-    for i in range(values.shape[0]):
-        if (excluded >> i) & 1 == 0 and (best < 0 or values[i] > values[best]):
-            best = i
-    return best
-
-
-@njit(cache=True, fastmath=False)
-def _exceeds(log_transition, log_alpha):
-    """Whether the transition state is more likely than a state, for which it leaves 1 - P(tau) (TransitionState)."""
-    share = math.exp(log_transition)
-    return share > (1.0 - share) * math.exp(log_alpha)
-
-
-@njit(cache=True, fastmath=False)
-def control_loop(
-    arm, controller, lambda_x, lambda_q, contact_states, smoothing, contact_stiffness, log_alpha, log_transition,
-    decoded, targets, previous, flags,
-):  # fmt: skip
-    """Algorithm vae-HMM-test from the decoded joints on, over N frames; `previous` and `flags` carry over.
-
-    contact_states is a bit mask. Returns commands (N, J), the contact flag (N,) that gates the IK, and the
-    stiffness (N,). `previous` (J,) is the last command; `flags` (3,): see STARTED, PROGRESS, VISITED.
-    """
-    n, size = decoded.shape
-    scratch, terms = ik_scratch(size), plain_terms(size)
-    commands, contact, stiffness = np.empty((n, size)), np.zeros(n, np.bool_), np.ones(n)
-    for k in range(n):
-        active = _argmax(log_alpha[k], 0)
-        contact[k] = (contact_states >> active) & 1 == 1
-        command, target = commands[k], targets[k]
-        prior, weight = (previous, 0.0) if controller == BASE_IK else (decoded[k], lambda_q)
-        if controller == BASE_IK or (controller == MILD_IK and contact[k]):
-            solve_ik_one(arm, target, prior, lambda_x, weight, terms, command, scratch)
-        else:
-            _copy(prior, command)
-        for i in range(size):
-            limited = min(max(command[i], arm[i, LOWER]), arm[i, UPPER])
-            if flags[STARTED] == 1:
-                limited = smoothing * limited + (1.0 - smoothing) * previous[i]
-            command[i] = min(max(limited, arm[i, LOWER]), arm[i, UPPER])
-        _copy(command, previous)
-        flags[STARTED] = 1
-
-        # the segment that drives the stiffness never returns to a state seen before the first contact; until a
-        # contact state was active, the transition state is one more candidate, and counts as contact
-        if contact[k]:
-            flags[PROGRESS] = TOUCHING
-        elif flags[PROGRESS] == REACHING:
-            flags[VISITED] |= 1 << active
-            if contact_states != 0 and _exceeds(log_transition[k], log_alpha[k, active]):
-                flags[PROGRESS] = CROSSING
-        if flags[PROGRESS] != REACHING:
-            segment = _argmax(log_alpha[k], flags[VISITED])
-            crossing = flags[PROGRESS] == CROSSING and _exceeds(log_transition[k], log_alpha[k, segment])
-            if crossing or (contact_states >> segment) & 1 == 1:
-                stiffness[k] = contact_stiffness
-    return commands, contact, stiffness

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,11 +18,14 @@ from mild_viz.robot.description import TURNING, Description, read_description
 from mild_viz.robot.ik import forward
 from mild_viz.robot.kinematics.tree import LinkTree, build_tree
 from mild_viz.robot.robots import find_robot
+from mild_viz.robot.source import RobotSource, published_description
 from mild_viz.robot.spec import ArmSpec, RobotSpec
 from mild_viz.robot.visuals import drawn_links, load_visuals
 
 if TYPE_CHECKING:
     import trimesh
+
+logger = logging.getLogger(__name__)
 
 MOVING = (*TURNING, "prismatic")
 """Joint types that a robot.toml may give a value to."""
@@ -129,23 +133,47 @@ def _lowest(mesh: trimesh.Trimesh, pose: Float[np.ndarray, "7"]) -> float:
 
 
 def load_robot(
-    name_or_path: str, joint_names: tuple[str, ...] | None = None, end_effector: str | None = None
+    name_or_path: str,
+    joint_names: tuple[str, ...] | None = None,
+    end_effector: str | None = None,
+    source: RobotSource = "own",
 ) -> RobotModel:
     """A robot by its name in `ROBOTS`, its folder (with a robot.toml), or the path of its URDF.
 
     Joints and end effector of the interacting arm default to those of the robot's first arm, else to Pepper's right
-    one. Raises `UserError` where the description is missing or broken, or lacks them (listing what it has).
+    one. With the source `robot_descriptions`, its looks are those of the manufacturer's description; where that cannot
+    be had, a warning says why, and they are ours.
+
+    Raises `UserError` where the description is missing or broken, or lacks joints (listing what it has).
     """
     spec = find_robot(name_or_path)
     description = read_description(spec.urdf)
     _check_values(spec, description)
     arms = {arm.name: arm for arm in _interacting_first(spec, joint_names, end_effector)}
     chains = {
-        name: load_chain(description, arm.joints, arm.end_effector, dict(spec.rest), arm.tip_offset)
+        name: replace(
+            load_chain(description, arm.joints, arm.end_effector, dict(spec.rest), arm.tip_offset),
+            elbow=arm.elbow,
+            position=arm.position,
+        )
         for name, arm in arms.items()
     }
     tree = build_tree(description, _all_joints(chains), dict(spec.rest), drawn_links(description))
-    return RobotModel(spec.name, replace(spec, arms=arms), chains, tree, description)
+    robot = RobotModel(spec.name, replace(spec, arms=arms), chains, tree, description)
+    return robot if source == "own" else _with_looks_of(robot, source)
+
+
+def _with_looks_of(robot: RobotModel, source: RobotSource) -> RobotModel:
+    """The robot, drawn as its manufacturer's description has it; as it is, with a warning, where that cannot be had."""
+    try:
+        theirs = published_description(robot.spec, robot.description)
+        tree = build_tree(theirs, _all_joints(robot.arms), dict(robot.spec.rest), drawn_links(theirs))
+        drawn = replace(robot, tree=tree, description=theirs)
+        _ = drawn.visuals  # read now: a mesh that is missing is found out while there is another choice
+    except UserError as error:
+        logger.warning("%s: no robot from %s, ours is shown: %s", robot.title, source, error)
+        return robot
+    return drawn
 
 
 def _interacting_first(spec: RobotSpec, joint_names: tuple[str, ...] | None, end_effector: str | None) -> list[ArmSpec]:

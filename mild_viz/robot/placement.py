@@ -20,7 +20,7 @@ from jaxtyping import Float
 from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import arm_length, contact_frames, in_frame, upright
-from mild_viz.robot.retarget_arm import LARGEST_FRACTION, scaled_wrist
+from mild_viz.robot.retarget_arm import hand_place, scaled_wrist
 from mild_viz.robot.workspace import HandMap
 from mild_viz.settings import MAX_PLACEMENT, Placement
 from mild_viz.trial import WRIST, Trial
@@ -80,9 +80,8 @@ class Meeting:
 
     def placement(self, chain: ArmChain) -> Placement:
         """Where a human stands who faces a robot, such that hands meet at the same fraction of reach."""
-        fraction = float(np.linalg.norm(self.partner))
-        reach = chain.reach * min(1.0, LARGEST_FRACTION / fraction) * np.array(self.partner)
-        return _placement(chain, chain.shoulder + reach - FACING @ self.human, self.source, estimated=True)
+        meeting = hand_place(chain, np.array([self.partner]))[0]
+        return _placement(chain, meeting - FACING @ self.human, self.source, estimated=True)
 
 
 class Sample(NamedTuple):

@@ -65,4 +65,12 @@ def find_robot(name_or_path: str) -> RobotSpec:
         raise UserError(f"robot '{name_or_path}': {path} is not a file; expected a URDF description")
     pepper = ROBOTS["pepper"]
     arms = {pepper.main.name: pepper.main}
-    return replace(pepper, name=path.stem, title=robot_title(path.stem), urdf=path, arms=arms, file=None)
+    return replace(
+        pepper,
+        name=path.stem,
+        title=robot_title(path.stem),
+        urdf=path,
+        arms=arms,
+        robot_descriptions=None,
+        file=None,
+    )

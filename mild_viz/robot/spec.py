@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from mild_viz.errors import UserError
+from mild_viz.robot.position_rule import PositionRule
 from mild_viz.settings import choose
 from mild_viz.toml_config import check_keys, converted, read_toml
 from mild_viz.trial import ACTIONS
@@ -38,6 +39,8 @@ class ArmSpec:
     """Joint whose origin is the elbow; None: the arm's elbow is nowhere in particular."""
     retarget: str = "position"
     """One of `RETARGETING`."""
+    position: PositionRule = PositionRule()
+    """How hand and elbow are held where `retarget` is position."""
     mirror_of: str | None = None
     """The arm that this one mirrors, joint by joint."""
     mirror_signs: tuple[float, ...] = ()
@@ -50,6 +53,8 @@ class StiffnessSpec:
 
     lowest: float = 0.0
     highest: float = 1.0
+    rate: float = 10.0
+    """Fastest change [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,9 @@ class SafetySpec:
 
     margin: float = 0.01
     """Distance that a command keeps from the limits of position [rad]."""
-    acceleration: float = 20.0
-    """Largest acceleration of every joint [rad/s^2]."""
+    acceleration: float | None = None
+    """Largest acceleration of every joint [rad/s^2]; None: what gets it to its largest speed in
+    `control.safety.RISE_TIME`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +83,8 @@ class RobotSpec:
     """Per action, where joints beyond the arms stand instead [rad or m]; they must not move an end effector."""
     stiffness: StiffnessSpec = StiffnessSpec()
     safety: SafetySpec = SafetySpec()
+    robot_descriptions: str | None = None
+    """Module of the package of that name that has the manufacturer's description."""
     file: Path | None = None
     """The robot.toml; None for a bare description."""
 
@@ -94,8 +102,10 @@ class RobotSpec:
         return self.main.end_effector
 
 
-KEYS = ("title", "description", "rest", "hands", "arms", "stiffness", "safety")
-ARM_KEYS: dict[str, Any] = {name: hint for name, hint in get_type_hints(ArmSpec).items() if name != "name"}
+KEYS = ("title", "description", "rest", "hands", "arms", "stiffness", "safety", "robot_descriptions")
+ARM_KEYS: dict[str, Any] = {
+    name: hint for name, hint in get_type_hints(ArmSpec).items() if name not in ("name", "position")
+}
 
 
 def read_spec(folder: Path) -> RobotSpec:
@@ -133,6 +143,7 @@ def read_spec(folder: Path) -> RobotSpec:
         hands={action: _values(hand, f"{file}: hands.{action}") for action, hand in hands.items()},
         stiffness=_stiffness(table.get("stiffness", {}), f"{file}: stiffness"),
         safety=_safety(table.get("safety", {}), f"{file}: safety"),
+        robot_descriptions=_module(table, f"{file}: robot_descriptions"),
         file=file,
     )
 
@@ -153,17 +164,30 @@ def _fields(value: Any, hints: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _arm(name: str, value: Any, where: str) -> ArmSpec:
-    fields = _fields(value, ARM_KEYS, where)
+    table = _table(value, where)
+    position = _fields(table.get("position", {}), get_type_hints(PositionRule), f"{where}.position")
+    fields = _fields({key: entry for key, entry in table.items() if key != "position"}, ARM_KEYS, where)
     for key in ("joints", "end_effector"):
         if not fields.get(key):
             raise UserError(f"{where}: {key} is missing; expected joints = [...] and end_effector = a link")
-    arm = ArmSpec(name, **fields)
+    arm = ArmSpec(name, **fields, position=PositionRule(**position))
     if len(set(arm.joints)) < len(arm.joints):
         raise UserError(f"{where}: joints names one twice: {', '.join(arm.joints)}")
     if arm.elbow is not None:
         choose(f"{where}: elbow", arm.elbow, arm.joints)
     choose(f"{where}: retarget", arm.retarget, RETARGETING)
+    _check_position(arm, f"{where}.position")
     return arm
+
+
+def _check_position(arm: ArmSpec, where: str) -> None:
+    rule = arm.position
+    if min(rule.level_weight, rule.elbow_weight, *rule.joint_weights) < 0.0 or not any(rule.tool_axis):
+        raise UserError(f"{where} has a weight below 0, or a tool_axis of length 0; expected weights of at least 0")
+    if len(rule.joint_weights) not in (0, len(arm.joints)):
+        raise UserError(f"{where}: joint_weights is {list(rule.joint_weights)}; expected {len(arm.joints)}, or none")
+    if rule.elbow_weight > 0.0 and (arm.elbow is None or not (rule.lean or rule.rise)):
+        raise UserError(f"{where}: elbow_weight is set; expected elbow of the arm, and lean or rise, with it")
 
 
 def _check_mirror(arm: ArmSpec, arms: Mapping[str, ArmSpec], where: str) -> None:
@@ -179,16 +203,25 @@ def _check_mirror(arm: ArmSpec, arms: Mapping[str, ArmSpec], where: str) -> None
         )
 
 
+def _module(table: Mapping[str, Any], where: str) -> str | None:
+    name = converted(table["robot_descriptions"], str, where) if "robot_descriptions" in table else None
+    if name is not None and not name.isidentifier():
+        raise UserError(f"{where} is {name!r}; expected the name of a module, such as panda_description")
+    return name
+
+
 def _stiffness(value: Any, where: str) -> StiffnessSpec:
     spec = StiffnessSpec(**_fields(value, get_type_hints(StiffnessSpec), where))
     if not 0.0 <= spec.lowest <= spec.highest <= 1.0:
         raise UserError(f"{where} is {spec.lowest} to {spec.highest}; valid: 0 <= lowest <= highest <= 1")
+    if not spec.rate > 0.0:
+        raise UserError(f"{where}: rate is {spec.rate}; valid: above 0 a second")
     return spec
 
 
 def _safety(value: Any, where: str) -> SafetySpec:
     spec = SafetySpec(**_fields(value, get_type_hints(SafetySpec), where))
-    if not (0.0 <= spec.margin <= 0.5 and spec.acceleration > 0.0):
+    if not (0.0 <= spec.margin <= 0.5 and (spec.acceleration is None or spec.acceleration > 0.0)):
         raise UserError(f"{where}: margin is {spec.margin}, acceleration {spec.acceleration}; valid: a margin of 0 to "
                         "0.5 rad, an acceleration above 0 rad/s^2")  # fmt: skip
     return spec

@@ -17,6 +17,7 @@ from mild_viz.errors import UserError
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.vae import VAE
 from mild_viz.pairs import Windows, stack_windows
+from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.robots import ROBOTS, robot_of
 from mild_viz.settings import VARIANTS
 from mild_viz.training.human_stage import HumanModel, train_human_stage
@@ -252,5 +253,6 @@ def _candidate(
         own_models=own_models,
         points=plan.source.train[0].points,
         rate=plan.rate,
+        contact_rules={action: DEFAULT_RULES[action] for action in human.hmms},
         hidden=plan.options.hidden,
     )

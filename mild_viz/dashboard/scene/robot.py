@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from mild_viz.dashboard.scene.labels import add_title
 from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.dashboard.scene.shapes import rotate
-from mild_viz.robot.robots import robot_title
 from mild_viz.rollout import Rollout
 
 ROOT = "/robot"
@@ -51,11 +50,11 @@ class RobotView:
     """One node per link, posed from the rollout."""
 
     def __init__(
-        self, server: viser.ViserServer, visuals: dict[str, trimesh.Trimesh], link_names: tuple[str, ...], name: str
+        self, server: viser.ViserServer, visuals: dict[str, trimesh.Trimesh], link_names: tuple[str, ...], title: str
     ) -> None:
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
         self._ghost_frame = server.scene.add_frame(f"{ROOT}/ghost", show_axes=False)
-        self._title, self._caption = add_title(server, ROOT, f"Robot: {robot_title(name)}")
+        self._title, self._caption = add_title(server, ROOT, f"Robot: {title}")
         self._visuals = {i: visuals[link] for i, link in enumerate(link_names) if link in visuals}
         self._solid = {
             i: server.scene.add_mesh_trimesh(
@@ -68,6 +67,11 @@ class RobotView:
         self._server = server
         self._frames: RobotFrames | None = None
         self._bounds: Float[np.ndarray, "2 3"] | None = None
+
+    def remove(self) -> None:
+        """Take everything out of the scene."""
+        self._ghost_frame.remove()
+        self._frame.remove()
 
     def bounds(self, rollout: Rollout) -> Float[np.ndarray, "2 3"]:
         """Lowest and highest corner of the links that stand still (of all, where every link moves), in world [m]."""

@@ -43,11 +43,26 @@ class Scene:
         self._ground = GroundView(server)
         colors = palette(dark)
         self._human = HumanView(server, colors)
-        self._robot = RobotView(server, robot.visuals, tuple(robot.link_names), robot.name)
-        self._compared = ComparedView(server, robot.visuals, robot.link_names)
-        self._volume = VolumeView(server, robot.chain)
+        self._make_robot_views(robot)
         self._latent = LatentView(server, colors)
         self._reach = ReachView(server)
+
+    def _make_robot_views(self, robot: RobotModel) -> None:
+        self._robot_model = robot
+        self._robot = RobotView(self._server, robot.visuals, robot.link_names, robot.title)
+        self._compared = ComparedView(self._server, robot.visuals, robot.link_names)
+        self._volume = VolumeView(self._server, robot.chain)
+
+    def set_robot(self, robot: RobotModel) -> None:
+        """Draw another robot from the next `show` on; the same one changes nothing."""
+        if robot is self._robot_model:
+            return
+        _ = robot.visuals  # a mesh that cannot be read must not leave the scene without a robot
+        with self._lock, self._server.atomic():
+            self._rollout = None  # it has poses of other links
+            for view in (self._robot, self._compared, self._volume):
+                view.remove()
+            self._make_robot_views(robot)
 
     @property
     def layout(self) -> Layout | None:

@@ -21,6 +21,12 @@ class VolumeView:
         self._server, self._chain = server, chain
         self._surface: viser.MeshHandle | None = None
 
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        if self._surface is not None:
+            self._surface.remove()
+            self._surface = None
+
     def show(self, colors: Palette, visible: bool) -> None:
         """Draw it or not."""
         if visible and self._surface is None:

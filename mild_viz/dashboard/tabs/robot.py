@@ -9,7 +9,6 @@ import viser
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, sentence, set_content, widget_id
-from mild_viz.robot.stiffness import COMPLIANT_ACTIONS
 from mild_viz.rollout import Rollout
 from mild_viz.settings import CONTROLLERS_OF, ControlSettings, Placement
 from mild_viz.trial import Trial
@@ -125,5 +124,5 @@ class RobotTab:
         # What has no effect on this rollout is not to be moved.
         for slider in (self._lambda_x, self._lambda_q):
             slider.disabled = rollout.controller != "mild-ik"
-        self._stiffness.disabled = rollout.inference.action not in COMPLIANT_ACTIONS
+        self._stiffness.disabled = not rollout.compliant
         set_content(self._source, f'<div class="mv-note">{escape(sentence(rollout.placement.source))}</div>')

@@ -11,6 +11,7 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.tabs.widgets import Changed, offer, on_person, option, set_content
 from mild_viz.errors import UserError
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 from mild_viz.settings import VARIANTS, InferSettings, Variant
 from mild_viz.trial import Trial
@@ -23,6 +24,12 @@ class TrialTab:
         self._catalog = catalog
         trial = catalog.dataset(first.dataset).trial(first.split, first.trial)
         self._last = (first.dataset, trial.action)
+        self._last_robot = catalog.robot_name
+        titles = catalog.robot_titles
+        self._robot = gui.add_dropdown(
+            "Robot", tuple(titles.values()), initial_value=titles[self._last_robot],
+            hint="The robot that answers. Models of two humans drive any; others the one that they were made for.",
+        )  # fmt: skip
         checkpoint = catalog.checkpoint(model)
         self._dataset = gui.add_dropdown(
             "Dataset", (first.dataset,), hint="Recordings that are on this machine and that a model fits."
@@ -44,21 +51,23 @@ class TrialTab:
         )  # fmt: skip
         self._note = gui.add_html("")
         self._others = gui.add_html("")
-        for handle in (self._dataset, self._model, self._action, self._trial, self._variant):
+        for handle in (self._robot, self._dataset, self._model, self._action, self._trial, self._variant):
             on_person(handle, changed)
 
-    def read(self) -> tuple[InferSettings, Checkpoint, Trial]:
-        """What is chosen, after offering what fits it. On a UserError the dataset is put back to the last good one."""
-        dataset = option(self._dataset)
-        new_dataset = dataset != self._last[0]
+    def read(self) -> tuple[InferSettings, Checkpoint, Trial, RobotModel]:
+        """What is chosen, after offering what fits it. On a UserError robot and dataset are put back to the last good.
+
+        A robot that no model drives on this dataset brings its own dataset, and a dataset its own robot.
+        """
         try:
-            models = self._catalog.models(dataset)
-            if not models:
-                problems = [str(self._catalog.problem(model, dataset)) for model in self._catalog.model_paths]
-                raise UserError(f"no model fits dataset '{dataset}': {'; '.join(problems) or 'there is none'}")
+            robot, dataset = self._robot_and_dataset()
         except UserError:
             self._dataset.value = self._last[0]
+            self._robot.value = self._catalog.robot_titles[self._last_robot]
             raise
+        new_dataset = (dataset, robot) != (self._last[0], self._last_robot)
+        self._last_robot = robot
+        models = self._catalog.models(dataset, robot)
         offer(self._model, models, models[0] if new_dataset else None)
         model = option(self._model)
         checkpoint = self._catalog.checkpoint(model)
@@ -70,7 +79,28 @@ class TrialTab:
         trial = trials[option(self._trial)]
         offer(self._variant, checkpoint.variants)
         settings = InferSettings(dataset, trial.split, trial.index, option(self._variant))
-        return settings, checkpoint, trial
+        return settings, checkpoint, trial, self._catalog.robot(robot)
+
+    def _robot_and_dataset(self) -> tuple[str, str]:
+        """The chosen names, each after the other where they do not go together; whichever changed last wins."""
+        titles = self._catalog.robot_titles
+        title, dataset = option(self._robot), option(self._dataset)
+        robot = next(name for name in titles if titles[name] == title)
+        if robot != self._last_robot:
+            fitting = self._catalog.dataset_for(robot, dataset)
+            if fitting is None:
+                raise UserError(f"no model here drives {title} on any dataset that is on this machine")
+            if fitting != dataset:
+                self._dataset.value = dataset = fitting
+        else:
+            answering = self._catalog.robot_for(dataset, robot)
+            if answering is None:
+                problems = [str(self._catalog.problem(model, dataset, robot)) for model in self._catalog.model_paths]
+                raise UserError(f"no model fits dataset '{dataset}': {'; '.join(problems) or 'there is none'}")
+            if answering != robot:
+                robot = answering
+                self._robot.value = titles[robot]
+        return robot, dataset
 
     def offer_datasets(self) -> None:
         """List the datasets that can be used, and how to get the others. Reads them: call it when the page stands."""

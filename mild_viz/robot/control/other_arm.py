@@ -1,0 +1,115 @@
+"""A robot's other arms: at rest, mirroring the one that interacts, following the human's left hand, or as decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mild_viz.data.windows import fill_gaps, max_gap
+from mild_viz.errors import UserError
+from mild_viz.robot.contact import in_frame
+from mild_viz.robot.control.controller import Controller, Frames, make_controller
+from mild_viz.robot.ik import forward
+from mild_viz.robot.model import RobotModel
+from mild_viz.rollout import OtherArm
+from mild_viz.trial import Skeleton
+
+LEFT_HAND = "left_wrist"
+"""What the other arm meets of the human, as the interacting one meets the right wrist."""
+
+
+def mirrored(robot: RobotModel, name: str, joints: Float[np.ndarray, "N J"]) -> Float[np.ndarray, "N K"]:
+    """The interacting arm's joints [rad] as the mirror image that another arm makes of them, within its limits.
+
+    Raises:
+        UserError: if robot.toml does not say how that arm mirrors the interacting one.
+    """
+    main, other = robot.spec.main, robot.spec.arms[name]
+    signs = ()
+    if other.mirror_of == main.name:
+        signs = other.mirror_signs
+    elif main.mirror_of == name:  # signs are their own inverse
+        signs = main.mirror_signs
+    if len(signs) != joints.shape[1]:
+        raise UserError(
+            f"robot {robot.name}: nothing says how arm '{name}' mirrors '{main.name}'; valid for it: rest, base-ik, "
+            "or mirror_of and mirror_signs in its robot.toml"
+        )
+    return np.clip(joints * np.array(signs), robot.arms[name].lower, robot.arms[name].upper)
+
+
+def move_other_arms(
+    robot: RobotModel,
+    controller: Controller,
+    frames: Frames,
+    skeleton: Skeleton | None,
+    T_world_human: Float[np.ndarray, "4 4"],
+    others_decoded: Mapping[str, Float[np.ndarray, "N _"]],
+) -> tuple[OtherArm, ...]:
+    """What the other arms do while `controller` moves the interacting one; nothing where they rest.
+
+    They follow the same states, contact rules and kind of limits. Only with IK do they need the human's left hand.
+    Where the model decodes their joints (`others_decoded`, by name), they do as the interacting one does.
+
+    Raises:
+        UserError: if the robot has no other arm, or no rule to mirror by, or the left hand was not recorded; or if the
+            model decodes the other arms' joints and the settings ask for something else.
+    """
+    chosen = controller.settings.other_arm
+    if others_decoded:
+        if chosen != "rest":
+            raise UserError(f"other_arm is {chosen}; valid for a model that moves all arms itself: rest (as it says)")
+        chosen = controller.settings.controller
+    if chosen == "rest":
+        return ()
+    if len(robot.arms) == 1:
+        raise UserError(f"robot {robot.name} has one arm; valid for the other arm: rest")
+    hand = _left_hand(skeleton, controller.rate, T_world_human, len(frames.decoded))
+    to_hand = chosen in ("base-ik", "mild-ik")
+    if to_hand and not np.isfinite(hand).any():
+        raise UserError(
+            f"the human's left hand was not recorded, which {chosen} needs; valid for the other arm: rest, mild"
+        )
+    settings = replace(controller.settings, controller=chosen)
+    arms = []
+    for name, chain in list(robot.arms.items())[1:]:
+        if name in others_decoded:
+            decoded = others_decoded[name]
+        elif chosen == "base-ik":
+            decoded = np.tile(chain.rest, (len(hand), 1))
+        else:
+            decoded = mirrored(robot, name, frames.decoded)
+        own = make_controller(robot, settings, controller.rules, controller.n_states, controller.rate, name)
+        seen = frames._replace(decoded=decoded)
+        if to_hand:
+            seen = seen._replace(targets=hand)
+        result = own.run(seen, own.start())
+        end_effector = forward(chain, result.joints)
+        arms.append(
+            OtherArm(
+                name=name,
+                controller=chosen,
+                joint_names=chain.joint_names,
+                joints_decoded=decoded,
+                joints_commanded=result.joints,
+                end_effector=end_effector,
+                target=hand,
+                hand_distance=np.linalg.norm(end_effector - hand, axis=1),
+                stiffness=result.stiffness,
+                fired=result.fired,
+            )
+        )
+    return tuple(arms)
+
+
+def _left_hand(
+    skeleton: Skeleton | None, rate: float, T_world_human: Float[np.ndarray, "4 4"], n: int
+) -> Float[np.ndarray, "N 3"]:
+    """The human's left wrist [m], short gaps bridged as those of the right one are; NaN where it is not known."""
+    if skeleton is None or LEFT_HAND not in skeleton.joint_names:
+        return np.full((n, 3), np.nan)
+    wrist = skeleton.positions[:, skeleton.joint_names.index(LEFT_HAND)]
+    return in_frame(T_world_human, fill_gaps(wrist, max_gap(rate)))
