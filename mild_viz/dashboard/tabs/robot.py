@@ -12,7 +12,7 @@ from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, o
 from mild_viz.robot.control.other_arm import other_arm_options
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
-from mild_viz.settings import CONTROLLERS, OTHER_ARM, ControlSettings, Placement
+from mild_viz.settings import CONTROLLERS_OF, OTHER_ARM, ControlSettings, Placement
 from mild_viz.trial import Trial
 
 WEIGHT_EXPONENTS = (-4.0, 2.0)
@@ -27,8 +27,9 @@ class RobotTab:
 
     def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
-            "Controller", CONTROLLERS, initial_value=default.controller,
-            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states.",
+            "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
+            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states. "
+            "task-space: both arms to the decoded hands.",
         )  # fmt: skip
         self._other_arm = gui.add_dropdown(
             "Other arm", OTHER_ARM, initial_value=default.other_arm,
@@ -85,7 +86,11 @@ class RobotTab:
     def read(
         self, checkpoint: Checkpoint, trial: Trial, robot: RobotModel, contact_states: frozenset[int]
     ) -> ControlSettings:
-        """The chosen settings, of what this robot can do. The placement is the trial's own until a person moves it."""
+        """The chosen settings, of what this robot and model can do. The placement is the trial's own until moved."""
+        controllers = CONTROLLERS_OF[checkpoint.decodes]
+        if tuple(self._controller.options) != controllers:
+            self._controller.options = controllers
+            self._controller.value = controllers[-1]
         others = other_arm_options(robot, trial.human_skeleton)
         self._other_arm.disabled = len(others) < 2
         offer(self._other_arm, others or ("rest",))

@@ -1,7 +1,8 @@
-"""The arms that do not interact: at rest, mirroring the one that does, or following the human's left hand."""
+"""A robot's other arms: at rest, mirroring the one that interacts, following the human's left hand, or as decoded."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -59,31 +60,44 @@ def move_other_arms(
     frames: Frames,
     skeleton: Skeleton | None,
     T_world_human: Float[np.ndarray, "4 4"],
+    others_decoded: Mapping[str, Float[np.ndarray, "N _"]],
 ) -> tuple[OtherArm, ...]:
     """What the other arms do while `controller` moves the interacting one; nothing where they rest.
 
     They follow the same states, contact rules and kind of limits. Only with IK do they need the human's left hand.
+    Where the model decodes their joints (`others_decoded`, by name), they do as the interacting one does.
 
     Raises:
-        UserError: if the robot has no other arm, or no rule to mirror by, or the left hand was not recorded.
+        UserError: if the robot has no other arm, or no rule to mirror by, or the left hand was not recorded; or if the
+            model decodes the other arms' joints and the settings ask for something else.
     """
     chosen = controller.settings.other_arm
+    if others_decoded:
+        if chosen != "rest":
+            raise UserError(f"other_arm is {chosen}; valid for a model that moves all arms itself: rest (as it says)")
+        chosen = controller.settings.controller
     if chosen == "rest":
         return ()
     if len(robot.arms) == 1:
         raise UserError(f"robot {robot.name} has one arm; valid for the other arm: rest")
     hand = _left_hand(skeleton, controller.rate, T_world_human, len(frames.decoded))
-    if chosen != "mild" and not np.isfinite(hand).any():
+    to_hand = chosen in ("base-ik", "mild-ik")
+    if to_hand and not np.isfinite(hand).any():
         raise UserError(
             f"the human's left hand was not recorded, which {chosen} needs; valid for the other arm: rest, mild"
         )
     settings = replace(controller.settings, controller=chosen)
     arms = []
     for name, chain in list(robot.arms.items())[1:]:
-        decoded = np.tile(chain.rest, (len(hand), 1)) if chosen == "base-ik" else mirrored(robot, name, frames.decoded)
+        if name in others_decoded:
+            decoded = others_decoded[name]
+        elif chosen == "base-ik":
+            decoded = np.tile(chain.rest, (len(hand), 1))
+        else:
+            decoded = mirrored(robot, name, frames.decoded)
         own = make_controller(robot, settings, controller.rules, controller.n_states, controller.rate, name)
         seen = frames._replace(decoded=decoded)
-        if chosen != "mild":
+        if to_hand:
             seen = seen._replace(targets=hand)
         result = own.run(seen, own.start())
         end_effector = forward(chain, result.joints)
