@@ -42,7 +42,7 @@ class ReachView:
         self._texts = distance_texts(rollout)
         self._label_positions = np.nan_to_num(label_positions(rollout))
         self._unreachable = out_of_reach(rollout)
-        self._aimed: Bool[np.ndarray, " N"] = np.isfinite(rollout.target).all(axis=1)
+        self._aimed = np.isfinite(rollout.target.sum(axis=1))
         self._target_colors = {True: colors.unreachable, False: colors.distance}
         self._known = np.isfinite(rollout.hand_distance) & rollout.inference.tracked
         # One colour for the whole line, from its creation on: the browser does not recompile a line whose colours
