@@ -21,7 +21,7 @@ class CompareFolder:
     """One checkbox per controller, and the table."""
 
     def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
-        with gui.add_folder("Compare controllers"):
+        with gui.add_folder("Compare controllers", expand_by_default=False):
             self._boxes = {
                 name: gui.add_checkbox(name, False, hint=f"Also run {name} on this trial, and draw its arm as a ghost.")
                 for name in CONTROLLER_COLORS
