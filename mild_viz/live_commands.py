@@ -94,7 +94,9 @@ def live(
     checkpoint, robot = run.load(dataset)
     action = choose_action(run.action, input, checkpoint)
     thresholds = thresholds.for_dataset(checkpoint.dataset)
-    model = live_model(checkpoint, run.variant or checkpoint.default_variant, action, robot, run.settings(), thresholds)
+    model = live_model(
+        checkpoint, run.variant or checkpoint.default_variant, action, robot, run.settings(checkpoint), thresholds
+    )
     source = open_input(rested(input))
     closing: list[Any] = [source]
     console = Console()

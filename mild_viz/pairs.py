@@ -93,8 +93,8 @@ def retarget(
 ) -> Float[np.ndarray, "T J"]:
     """Joints [rad] of a robot that moves as a person's right arm (shoulder, elbow, wrist [m]) at `rate` [Hz].
 
-    Pepper's arm takes over the angles of the person's, every other one the place of the hand, by
-    `robot.retarget_arm`, which says what the other arguments are.
+    The robot's own rule says how (`ArmSpec.retarget`): Pepper's arm takes over the angles of the person's, every other
+    one the place of the hand, by `robot.retarget_arm`, which says what the other arguments are.
     """
     if robot.spec.main.retarget == "pepper-angles":
         return retarget_pepper(arm)
@@ -133,6 +133,16 @@ def check_rate(rate: float | None, model: str, trials: Sequence[Trial]) -> None:
             )
 
 
+def check_points(points: Sequence[str], model: str, trials: Sequence[Trial]) -> None:
+    """Refuse trials that show a model other points of the human than it was trained on. Raises `UserError`."""
+    for trial in trials:
+        if tuple(trial.points) != tuple(points):
+            raise UserError(
+                f"checkpoint {model} reads {', '.join(points)} of the human, trial {trial.name} gives "
+                f"{', '.join(trial.points)}; valid: a dataset that gives {', '.join(points)}"
+            )
+
+
 def rates_differ(rate: float | None, other: float) -> bool:
     """Whether a rate [Hz] is another one than a model's; clocks are not exact, and a model may not know its own."""
     return rate is not None and not abs(other - rate) <= 0.01 * rate
@@ -142,12 +152,12 @@ def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) ->
     """Windows of all trials; the partner is the robot with `joint_names`, or the second human if None."""
     humans, partners, indices, steps = [], [], [], []
     for index, trial in enumerate(trials):
-        arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
+        points, others = fill_gaps(trial.human_points, max_gap(trial.rate)), trial.partner_points
         if joint_names is not None:
-            human, partner = pair_windows(arm, robot_truth(trial, joint_names))
-        elif trial.partner_arm is not None:
-            human = human_windows(arm)[:-WINDOW]
-            partner = human_windows(fill_gaps(trial.partner_arm, max_gap(trial.rate)))[WINDOW:]
+            human, partner = pair_windows(points, robot_truth(trial, joint_names))
+        elif others is not None:
+            human = human_windows(points)[:-WINDOW]
+            partner = human_windows(fill_gaps(others, max_gap(trial.rate)))[WINDOW:]
         else:
             raise UserError(f"trial {trial.name} has no second human")
         humans.append(human)

@@ -6,7 +6,13 @@ from pathlib import Path
 
 from mild_viz.errors import UserError
 
-SHIPPED_MODELS = {"demo": "demo", "nuisi": "nuisi-pepper", "yumi": "yumi", "handover": "handover-panda"}
+SHIPPED_MODELS = {
+    "demo": "demo",
+    "nuisi": "nuisi-pepper",
+    "yumi": "yumi",
+    "handover": "handover-panda",
+    "handover-hands": "handover-hands",
+}
 """Folder under `checkpoints/` that holds the model for a dataset."""
 
 PACKAGE = Path(__file__).resolve().parent

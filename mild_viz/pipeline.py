@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
-from mild_viz.decoding import decoding_of, open_robot
+from mild_viz.decoding import decoding_of, hand_map_of, open_robot, points_of
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
-from mild_viz.pairs import check_rate, window_errors
+from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame, nearest_wrists
 from mild_viz.robot.control.controller import Frames, make_controller
@@ -26,8 +26,8 @@ from mild_viz.robot.control.other_arm import move_other_arms
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import WINDOW, ControlSettings
-from mild_viz.trial import Trial
+from mild_viz.settings import CONTROLLERS_OF, WINDOW, ControlSettings, choose
+from mild_viz.trial import WRIST, Trial
 
 NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
@@ -44,11 +44,13 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
     """
     decoding = decoding_of(checkpoint, robot or open_robot(checkpoint), trial.rate)
     check_rate(checkpoint.rate, checkpoint.name, [trial])
+    check_points(checkpoint.points, checkpoint.name, [trial])
     n_windows = trial.n_frames - 2 * WINDOW + 1
     if n_windows < 1:
         raise UserError(f"trial {trial.name} has {trial.n_frames} frames; expected at least {2 * WINDOW}")
-    arm = fill_gaps(trial.human_arm, max_gap(trial.rate))
-    said = predict(checkpoint, variant, trial.action, human_windows(arm)[:n_windows])
+    seen = trial.human_points
+    points = fill_gaps(seen, max_gap(trial.rate))
+    said = predict(checkpoint, variant, trial.action, human_windows(points)[:n_windows])
 
     model = checkpoint.members(variant)[0]
     hmm, size = model.hmms[trial.action], model.human_vae.latent_size
@@ -69,7 +71,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         joint_names=decoding.joint_names,
         time=np.arange(NEWEST, NEWEST + n_windows) / trial.rate,
         observed=observed_rows(said.human_mean),
-        tracked=observed_rows(trial.human_arm[newest].reshape(n_windows, -1)),
+        tracked=observed_rows(seen[newest].reshape(n_windows, -1)),
         log_alpha_human=said.log_alpha,
         log_alpha_joint=joint_log_alpha(model, trial.action, said.human_mean, latent_truth),
         log_alpha_unobserved=unobserved_forward(hmm, n_windows),
@@ -88,15 +90,17 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         robot_state_means=hmm.emission_means[:, partner],
         robot_state_covariances=hmm.emission_covariances[:, partner, partner],
         human_arm=trial.human_arm[newest],
-        human_hand=arm[newest, 2],
+        human_hand=points[newest, checkpoint.points.index(WRIST)],
         human_skeleton=None if trial.human_skeleton is None else trial.human_skeleton.rows(newest),
         partner_skeleton=None if trial.partner_skeleton is None else trial.partner_skeleton.rows(newest),
         object_track=None if trial.object_track is None else trial.object_track.rows(newest),
         transfer=transfer_row(trial, n_windows),
         phase=None if trial.phase is None else trial.phase[newest],
-        decodes=decoding.decodes,
+        decodes=checkpoint.decodes,
         partner_decoded=moved.partner,
-        partner_truth=None if moved.partner is None else truth.features[first, :9].reshape(-1, 3, 3),
+        partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
+        others_decoded=moved.others,
+        others_truth={arm: joints[first] for arm, joints in truth.others.items()},
     )
 
 
@@ -113,10 +117,17 @@ def joint_log_alpha(
 def control(
     inference: Inference, checkpoint: Checkpoint, robot: RobotModel, trial: Trial, settings: ControlSettings
 ) -> Rollout:
-    """The commands that a controller makes of an inference, and where everything stands: world is the robot's base."""
+    """The commands that a controller makes of an inference, and where everything stands: world is the robot's base.
+
+    Raises:
+        UserError: for a controller that does not go with what the model decodes, contact states that do not exist, or
+            another arm that cannot be moved as the settings say.
+    """
+    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[inference.decodes])
     settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
     transition = checkpoint.transition_state_of(inference.variant, inference.action)
-    placed = place_human(robot.chain, trial, settings.placement, checkpoint.placement_for(robot.chain))
+    stored, follow = checkpoint.placement_for(robot.chain), hand_map_of(checkpoint, robot)
+    placed = place_human(robot.chain, trial, settings.placement, stored, follow)
     target = in_frame(placed.T_world_human, inference.human_hand)
     rules = checkpoint.contact_rules_of(inference.action)
     controller = make_controller(robot, settings, rules, inference.n_states, inference.rate)
@@ -130,7 +141,9 @@ def control(
         seconds=np.full(inference.n_windows, 1.0 / inference.rate),
     )
     result = controller.run(frames, controller.start())
-    others = move_other_arms(robot, controller, frames, inference.human_skeleton, placed.T_world_human)
+    others = move_other_arms(
+        robot, controller, frames, inference.human_skeleton, placed.T_world_human, inference.others_decoded
+    )
     commanded, decoded = (
         {arm.name: getattr(arm, f"joints_{kind}") for arm in others} for kind in ("commanded", "decoded")
     )

@@ -27,7 +27,8 @@ from mild_viz.latent.hmm import HMM, check_hmm
 from mild_viz.latent.vae import VAE, make_vae
 from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import HUMAN_FEATURES, VARIANTS, WINDOW, choose
+from mild_viz.settings import POINT_FEATURES, VARIANTS, WINDOW, choose
+from mild_viz.trial import ARM_POINTS
 
 ACTIONS = ("wave", "handshake", "rocket", "parachute")
 """Order of the authors' HMMs: the labels of the NuiSI file."""
@@ -192,7 +193,7 @@ def import_published(file: Path, out: Path) -> Checkpoint:
             raise UserError(
                 f"{file} drives {n_joints} joints; only Pepper models ({len(pepper.joint_names)}) can be imported"
             )
-        human_vae = _vae(content["model_h"], WINDOW * HUMAN_FEATURES, latent, f"{file}: model_h")
+        human_vae = _vae(content["model_h"], WINDOW * POINT_FEATURES * len(ARM_POINTS), latent, f"{file}: model_h")
         robot_vae = _vae(content["model_r"], WINDOW * n_joints, latent, f"{file}: model_r")
         hmms = {a: _hmm(ssm.state, f"{file}: ssm {a}") for a, ssm in zip(ACTIONS, content["ssm"], strict=True)}
         recorded = {key: value for key, value in arguments.items() if isinstance(value, (str, int, float, bool))}

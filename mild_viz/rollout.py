@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,9 @@ SAVED = (
 """Names of the arrays in a rollout file; row n of all of them belongs to human window n."""
 
 
-ERROR_UNITS = {"joints": "rad²", "arm": "m²"}
-"""By what a model decodes of the partner: a robot's joints, or a second human's arm, which the robot then follows."""
+ERROR_UNITS = {"joints": "rad²", "arm": "m²", "hands": "m²"}
+"""By what a model decodes of the partner: a robot's joints; a second human's arm, or both hands, which the robot then
+follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +87,13 @@ class Inference:
     phase: Int[np.ndarray, " N"] | None = None
     decodes: str = "joints"
     """What the model decodes of the partner: a key of `ERROR_UNITS`."""
-    partner_decoded: Float[np.ndarray, "N 3 3"] | None = None
-    """The second human's arm that was decoded, in that person's own frame [m]; None where joints were."""
-    partner_truth: Float[np.ndarray, "N 3 3"] | None = None
+    partner_decoded: Float[np.ndarray, "N P 3"] | None = None
+    """The second human's points that were decoded, in that person's own frame [m]; None where joints were."""
+    partner_truth: Float[np.ndarray, "N P 3"] | None = None
     """The same as recorded; NaN where the truth is unknown."""
+    others_decoded: Mapping[str, Float[np.ndarray, "N _"]] = field(default_factory=dict)
+    """`joints_decoded` of the robot's other arms, by name; those that are not named rest."""
+    others_truth: Mapping[str, Float[np.ndarray, "N _"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -119,7 +124,7 @@ class OtherArm:
     controller: str
     joint_names: tuple[str, ...]
     joints_decoded: Float[np.ndarray, "N K"]
-    """The decoded joints, mirrored; the resting joints where the controller takes none."""
+    """The decoded joints, its own or mirrored; the resting joints where the controller takes none."""
     joints_commanded: Float[np.ndarray, "N K"]
     end_effector: Float[np.ndarray, "N 3"]
     """World [m]."""

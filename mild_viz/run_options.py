@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # Written out so that --help lists them and a shell completes them; a test holds them equal to the tables.
 VariantName = Literal["v1", "v2.1", "v2.2", "v3.1", "v3.2", "v4"]
-ControllerName = Literal["base-ik", "mild", "mild-ik"]
+ControllerName = Literal["base-ik", "mild", "mild-ik", "task-space"]
 OtherArmName = Literal["rest", "base-ik", "mild", "mild-ik"]
 SplitName = Literal["train", "test"]
 SourceName = Literal["own", "robot_descriptions"]
@@ -34,6 +34,9 @@ OptionalNames = Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME [N
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 OptionalVariant = Annotated[
     VariantName | None, tyro.conf.arg(metavar="{v1,v2.1,v2.2,v3.1,v3.2,v4}", help_behavior_hint="")
+]
+OptionalController = Annotated[
+    ControllerName | None, tyro.conf.arg(metavar="{base-ik,mild,mild-ik,task-space}", help_behavior_hint="")
 ]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalStates = Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="INT [INT ...]", help_behavior_hint="")]
@@ -78,7 +81,8 @@ class ModelOptions:
         variant: Variant of MILD. Default: v3.1, or the first one of a model without it. Example: --variant v2.1
         controller: What makes the command: mild (decoded joints), mild-ik (decoded joints, adapted by inverse
             kinematics in contact states) or base-ik (inverse kinematics to the hand at every frame, without the
-            model). Example: --controller mild
+            model); for a model of two hands task-space (inverse kinematics of both arms to the decoded hands).
+            Default: mild-ik, or task-space. Example: --controller mild
         other_arm: What the robot's other arm does: rest, mild (the decoded joints, mirrored), base-ik (it follows the
             human's left hand, where that was recorded) or mild-ik (both). Example: --other-arm mild
         contact_states: States of the HMM in which the partners touch. Default: the model's own, as saved from
@@ -101,7 +105,7 @@ class ModelOptions:
 
     checkpoint: OptionalPath = None
     variant: OptionalVariant = None
-    controller: ControllerName = "mild-ik"
+    controller: OptionalController = None
     other_arm: OtherArmName = "rest"
     contact_states: OptionalStates = None
     lambda_x: float = 1.0
@@ -112,12 +116,12 @@ class ModelOptions:
     robot: OptionalText = None
     robot_source: SourceName = "own"
 
-    def settings(self) -> ControlSettings:
-        """The settings of the controller."""
-        from mild_viz.settings import ControlSettings, Placement
+    def settings(self, checkpoint: Checkpoint) -> ControlSettings:
+        """The settings of the controller, where none is chosen the default one for what the model decodes."""
+        from mild_viz.settings import CONTROLLERS_OF, ControlSettings, Placement
 
         return ControlSettings(
-            controller=self.controller,
+            controller=self.controller or CONTROLLERS_OF[checkpoint.decodes][-1],
             other_arm=self.other_arm,
             lambda_x=self.lambda_x,
             lambda_q=self.lambda_q,
@@ -142,7 +146,7 @@ class RunOptions(ModelOptions):
     """What to run the pipeline on: model, trial and controller.
 
     Attributes:
-        dataset: Recordings: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
+        dataset: Recordings: demo, nuisi, yumi, handover, handover-hands, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
     """
@@ -159,4 +163,4 @@ class RunOptions(ModelOptions):
         trial = load_dataset(self.dataset).trial(self.split, self.trial)
         checkpoint, robot = self.load(self.dataset)
         inference = infer(checkpoint, trial, self.variant or checkpoint.default_variant, robot)
-        return control(inference, checkpoint, robot, trial, self.settings()), robot
+        return control(inference, checkpoint, robot, trial, self.settings(checkpoint)), robot

@@ -9,8 +9,11 @@ from mild_viz.errors import UserError
 WINDOW = 5
 """Observations in one window (Sec. V-B of the paper)."""
 
-HUMAN_FEATURES = 18
-"""Human features of one frame: three arm joints, position and velocity."""
+POINT_FEATURES = 6
+"""Features of one point of a person in one frame: position and velocity."""
+
+ARM_FEATURES = 3 * POINT_FEATURES
+"""Those of an arm: shoulder, elbow, wrist."""
 
 STATE_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C8C8C")
 """Colour of each HMM state, after Okabe and Ito (safe for colour-blind readers)."""
@@ -54,9 +57,19 @@ MAX_PLACEMENT = 100
 """A human stands nearer than this to the robot, in each direction [m]."""
 
 ALPHA_MODES = ("human", "joint", "unobserved")
-CONTROLLERS = ("base-ik", "mild", "mild-ik")
-OTHER_ARM = ("rest", *CONTROLLERS)
-"""What a robot's other arms do; see `pipeline.control`."""
+CONTROLLERS = ("base-ik", "mild", "mild-ik", "task-space")
+"""What makes a command: inverse kinematics to the human's hand, the decoded joints, those adapted by inverse kinematics
+in contact, or inverse kinematics of all arms to the decoded hands."""
+
+CONTROLLERS_OF = {
+    "joints": ("base-ik", "mild", "mild-ik"),
+    "arm": ("base-ik", "mild", "mild-ik"),
+    "hands": ("task-space",),
+}
+"""Those that a model can have, by what it decodes of the partner (`Checkpoint.decodes`); the last is the default."""
+
+OTHER_ARM = ("rest", "base-ik", "mild", "mild-ik")
+"""What a robot's other arms do; see `pipeline.control`. In task space the model says."""
 
 
 def choose(kind: str, value: str, valid: tuple[str, ...] | list[str]) -> str:

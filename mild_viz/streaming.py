@@ -7,6 +7,7 @@ Fed with the frames of a trial it gives the numbers of `pipeline.infer` and `pip
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,7 +25,8 @@ from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.control.controller import ControlCarry, Controller, ControlResult, Frames, make_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import HUMAN_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.settings import CONTROLLERS_OF, POINT_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.trial import WRIST
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +34,16 @@ class StreamModel:
     """What does not change between observations."""
 
     models: tuple[InteractionModel, ...]
+    points: tuple[str, ...]
+    """What is observed of the human (`Checkpoint.points`)."""
     variant: str
     action: str
     robot: RobotModel
     decoding: Decoding
     settings: ControlSettings
     controller: Controller
+    others: Mapping[str, Controller]
+    """Those of the robot's other arms that the model moves, by name."""
     uses_transition: bool
     T_world_human: Float[np.ndarray, "4 4"]
     rate: float
@@ -52,16 +58,18 @@ class Carry(NamedTuple):
     features: Float[np.ndarray, "W F"]
     """The last window of features; NaN where not observed."""
     n_frames: int
-    last_seen: Float[np.ndarray, "3 3"] | None
-    """The last complete arm."""
+    last_seen: Float[np.ndarray, "P 3"] | None
+    """The last complete observation."""
     gap: int
     """Frames since it was seen."""
-    previous: Float[np.ndarray, " 9"] | None
+    previous: Float[np.ndarray, "P 3"] | None
     """The previous frame's filled position."""
     models: tuple[ModelCarry, ...]
     decoding: Float[np.ndarray, " J"]
     """The last decoded joints."""
     control: ControlCarry
+    others: Mapping[str, ControlCarry]
+    """Of the robot's other arms that the model moves, by name; `joints` is what to send to each."""
     command: Command | None
     """The last command."""
 
@@ -101,7 +109,7 @@ def stream_model(
 
     Raises:
         UserError: if the checkpoint does not know the variant or the action, or was trained at another rate; or if the
-            settings move another arm: a stream is of the human's right arm, and drives one arm.
+            settings move another arm: a stream drives the arms that the model moves.
     """
     choose(f"checkpoint {checkpoint.name}: action", action, checkpoint.actions)
     if rates_differ(checkpoint.rate, rate):
@@ -110,16 +118,26 @@ def stream_model(
             f"observations at {checkpoint.rate:g} Hz, or a model trained on such"
         )
     if settings.other_arm != "rest":
-        raise UserError(f"other_arm is {settings.other_arm}; valid for a stream, which drives one arm: rest")
+        raise UserError(
+            f"other_arm is {settings.other_arm}; valid for a stream, which drives the arms that the model moves: rest"
+        )
+    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[checkpoint.decodes])
     settings = with_contact_states(settings, checkpoint, variant, action)
+    rules, decoding = checkpoint.contact_rules_of(action), decoding_of(checkpoint, robot, rate)
+
+    def controller(arm: str | None) -> Controller:
+        return make_controller(robot, settings, rules, checkpoint.n_states, rate, arm)
+
     return StreamModel(
         models=checkpoint.members(variant),
+        points=checkpoint.points,
         variant=variant,
         action=action,
         robot=robot,
-        decoding=decoding_of(checkpoint, robot, rate),
+        decoding=decoding,
         settings=settings,
-        controller=make_controller(robot, settings, checkpoint.contact_rules_of(action), checkpoint.n_states, rate),
+        controller=controller(None),
+        others={arm: controller(arm) for arm in decoding.other_arms},
         uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
         T_world_human=T_world_human,
         rate=rate,
@@ -129,38 +147,43 @@ def stream_model(
 
 def start(model: StreamModel) -> Carry:
     """The state before the first observation: the robot rests."""
-    empty = np.full((WINDOW, HUMAN_FEATURES), np.nan)
+    empty = np.full((WINDOW, POINT_FEATURES * len(model.points)), np.nan)
     starts = tuple(each.start() for each in model.models)
-    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), model.controller.start(), None)
+    others = {arm: controller.start() for arm, controller in model.others.items()}
+    return Carry(empty, 0, None, 0, None, starts, model.decoding.start(), model.controller.start(), others, None)
 
 
 def step(
-    model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"], seconds: float | None = None
+    model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"], seconds: float | None = None
 ) -> tuple[Carry, Command | None]:
-    """Take one observation of the human's arm (shoulder, elbow, wrist [m]; NaN where lost).
+    """Take one observation of the human's `points` (an arm: shoulder, elbow, wrist) [m]; NaN where lost.
 
     `seconds` is the time since the last command [s], which the limits of the robot are about: by default that between
     two observations. Returns the new carry, and the command for the next frame: None until five observations were
     taken.
     """
-    seen = _observe(model, carry, arm)
+    seen = _observe(model, carry, points)
     if seen.n_frames < WINDOW:
         return seen, None
     window = seen.features.reshape(1, -1)
     if np.isnan(window).any():
         window = np.full_like(window, np.nan)
     said, models = advance(model.models, model.variant, model.action, window, seen.models, model.rate)
-    decoded, _, following = model.decoding.move(said.decoded, seen.decoding)
-    hand = np.full(3, np.nan) if seen.previous is None else seen.previous[6:9]
+    moved = model.decoding.move(said.decoded, seen.decoding)
+    hand = np.full(3, np.nan) if seen.previous is None else seen.previous[model.points.index(WRIST)]
     frames = Frames(
         log_alpha=said.log_alpha,
         log_transition=said.log_transition if model.uses_transition else np.full(1, -np.inf),
-        decoded=decoded,
+        decoded=moved.joints,
         targets=in_frame(model.T_world_human, hand[None]),
-        tracked=np.array([not np.isnan(arm).any()]),
+        tracked=np.array([not np.isnan(points).any()]),
         seconds=np.array([1.0 / model.rate if seconds is None else seconds], dtype=float),
     )
     result = model.controller.run(frames, seen.control)
+    others = {
+        arm: controller.run(frames._replace(decoded=moved.others[arm]), seen.others[arm])
+        for arm, controller in model.others.items()
+    }
     command = Command(
         log_alpha=said.log_alpha[0],
         log_transition=float(said.log_transition[0]),
@@ -169,11 +192,12 @@ def step(
         human_latent_std=said.human_std[0],
         robot_latent_mean=said.robot_mean[0],
         robot_latent_covariance=said.robot_covariance[0],
-        joints_decoded=decoded[0],
+        joints_decoded=moved.joints[0],
         target=frames.targets[0],
         **_sent(result),
     )
-    return seen._replace(models=models, decoding=following, control=result.carry, command=command), command
+    seen = seen._replace(models=models, decoding=moved.carry, control=result.carry, others=_carries(others))
+    return seen._replace(command=command), command
 
 
 def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Command]:
@@ -184,6 +208,7 @@ def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Comma
     observation after a pause longer than `data.windows` bridges is the first of a new window.
     """
     result = model.controller.idle(carry.control, seconds)
+    others = {arm: controller.idle(carry.others[arm], seconds) for arm, controller in model.others.items()}
     if carry.command is None:
         size, n_states = model.models[0].human_vae.latent_size, model.controller.n_states
         nothing = {
@@ -198,7 +223,11 @@ def idle(model: StreamModel, carry: Carry, seconds: float) -> tuple[Carry, Comma
     if result.carry.age * model.rate > model.max_gap:
         empty = np.full_like(carry.features, np.nan)
         carry = carry._replace(features=empty, previous=None, last_seen=None)
-    return carry._replace(control=result.carry, command=command), command
+    return carry._replace(control=result.carry, others=_carries(others), command=command), command
+
+
+def _carries(results: Mapping[str, ControlResult]) -> dict[str, ControlCarry]:
+    return {arm: result.carry for arm, result in results.items()}
 
 
 def _sent(result: ControlResult) -> dict[str, Any]:
@@ -211,17 +240,13 @@ def _sent(result: ControlResult) -> dict[str, Any]:
     }
 
 
-def _observe(model: StreamModel, carry: Carry, arm: Float[np.ndarray, "3 3"]) -> Carry:
+def _observe(model: StreamModel, carry: Carry, points: Float[np.ndarray, "P 3"]) -> Carry:
     """Fill a gap, take the velocity, shift the window: what data.windows does for a whole trial."""
-    if np.isnan(arm).any():
-        gap = carry.gap + 1
-        filled = carry.last_seen if carry.last_seen is not None and gap <= model.max_gap else np.full((3, 3), np.nan)
-        last_seen = carry.last_seen
+    if np.isnan(points).any():
+        gap, last_seen = carry.gap + 1, carry.last_seen
+        filled = last_seen if last_seen is not None and gap <= model.max_gap else np.full_like(points, np.nan)
     else:
-        gap, filled, last_seen = 0, arm, arm
-    position = filled.reshape(9)
-    velocity = np.zeros(9) if carry.previous is None else position - carry.previous
-    features = np.concatenate([carry.features[1:], np.concatenate([position, velocity])[None]])
-    return carry._replace(
-        features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=position
-    )
+        gap, filled, last_seen = 0, points, points
+    velocity = np.zeros_like(filled) if carry.previous is None else filled - carry.previous
+    features = np.concatenate([carry.features[1:], np.concatenate([filled, velocity]).reshape(1, -1)])
+    return carry._replace(features=features, n_frames=carry.n_frames + 1, last_seen=last_seen, gap=gap, previous=filled)

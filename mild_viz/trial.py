@@ -15,6 +15,15 @@ ACTIONS = ("wave", "handshake", "rocket", "parachute", "handover")
 CONTACT_ACTIONS = ("handshake", "rocket", "parachute", "handover")
 """Actions in which the partners touch."""
 
+WRIST = "right_wrist"
+"""The hand that meets the other's: among the points of every model."""
+
+ARM_POINTS = ("right_shoulder", "right_elbow", WRIST)
+"""The points of `Trial.human_arm`, in its order; all body models use these names."""
+
+HAND_POINTS = (WRIST, "left_wrist")
+"""What a model of two hands reads."""
+
 PHASES = ("rest", "reach", "contact", "return")
 """Meaning of the integers in `Trial.phase`."""
 
@@ -46,6 +55,13 @@ class Skeleton:
     def rows(self, rows: slice) -> Skeleton:
         """Some of its frames."""
         return Skeleton(self.joint_names, self.bones, self.positions[rows])
+
+    def joints(self, names: tuple[str, ...]) -> Float[np.ndarray, "T P 3"]:
+        """The positions of some joints [m]; a name that is not there raises a `UserError`."""
+        for name in names:
+            if name not in self.joint_names:
+                raise UserError(f"the skeleton has no joint '{name}'; it has: {', '.join(self.joint_names)}")
+        return self.positions[:, [self.joint_names.index(name) for name in names]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +121,8 @@ class Trial:
     """True phase of every frame (index into `PHASES`), where it is known."""
     active: Int[np.ndarray, " T"] | None = None
     """1 where the recording's own labels say that the action is going on (HRI-Yumi)."""
+    points: tuple[str, ...] = ARM_POINTS
+    """What a model reads of the human, and of a second human: the arm, or joints of the skeletons."""
 
     def __post_init__(self) -> None:
         if self.action not in ACTIONS:
@@ -128,6 +146,26 @@ class Trial:
     @property
     def n_frames(self) -> int:
         return len(self.human_arm)
+
+    @property
+    def human_points(self) -> Float[np.ndarray, "T P 3"]:
+        """Where the human's `points` are [m], in the human's own frame."""
+        points = self._points(self.human_arm, self.human_skeleton)
+        if points is None:
+            raise UserError(f"trial {self.name} has no skeleton, which {', '.join(self.points)} would be read from")
+        return points
+
+    @property
+    def partner_points(self) -> Float[np.ndarray, "T P 3"] | None:
+        """The same of the second human, in that person's own frame; None where there is none."""
+        return self._points(self.partner_arm, self.partner_skeleton)
+
+    def _points(
+        self, arm: Float[np.ndarray, "T 3 3"] | None, skeleton: Skeleton | None
+    ) -> Float[np.ndarray, "T P 3"] | None:
+        if self.points == ARM_POINTS:
+            return arm
+        return None if skeleton is None else skeleton.joints(self.points)
 
 
 @dataclass(frozen=True, eq=False)

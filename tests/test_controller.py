@@ -14,7 +14,7 @@ from mild_viz.robot.control.controller import ControlCarry, Controller, make_con
 from mild_viz.robot.control.rules import DEFAULT_RULES
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import load_robot
-from mild_viz.settings import CONTROLLERS, ControlSettings
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings
 from tests.controllers import LOW, RATE, cut, frames, unhindered
 
 ROBOT = load_robot("pepper")
@@ -76,7 +76,7 @@ def plain_loop(chain: ArmChain, settings: ControlSettings, action: str, log_alph
     return np.array(joints), np.array(contact), np.array(stiffness)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 @pytest.mark.parametrize("action", ["handshake", "rocket"])
 @pytest.mark.parametrize("smoothing", [0.8, 1.0])
 def test_equals_a_plain_loop(interaction, controller, action, smoothing):
@@ -93,7 +93,7 @@ def own(settings: ControlSettings, action: str = "handshake") -> Controller:
     return make_controller(ROBOT, settings, DEFAULT_RULES[action], STATES, RATE)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_streaming_equals_batch_bit_for_bit(interaction, controller):
     used, whole = own(ControlSettings(controller=controller, contact_states=CONTACT)), frames(*interaction)
     batch = used.run(whole, used.start())

@@ -12,16 +12,16 @@ from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import infer
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
-from mild_viz.settings import CONTROLLERS, ControlSettings
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings
 
 
 def test_figures_are_what_they_are_defined_as() -> None:
     checkpoint, robot = load_checkpoint(default_checkpoint("demo")), load_robot("pepper")
     trial = next(trial for trial in load_dataset("demo").test if trial.action == "handshake")
     inference, settings = infer(checkpoint, trial, "v3.1"), ControlSettings(lambda_x=2.0, lambda_q=0.05)
-    rollouts = run_controllers(inference, checkpoint, robot, trial, settings, CONTROLLERS)
+    rollouts = run_controllers(inference, checkpoint, robot, trial, settings, CONTROLLERS_OF["joints"])
     figures = [controller_figures(rollout, robot.chain, 2.0, 0.05) for rollout in rollouts]
-    assert tuple(one.controller for one in figures) == CONTROLLERS
+    assert tuple(one.controller for one in figures) == CONTROLLERS_OF["joints"]
     for rollout, one in zip(rollouts, figures, strict=True):
         assert rollout.inference is inference
         rows = [

@@ -21,7 +21,7 @@ from mild_viz.pipeline import control, infer, state_visits
 from mild_viz.robot.control import rules
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.rollout import SAVED, Rollout
-from mild_viz.settings import CONTROLLERS, PAPER_VARIANTS, VARIANTS, ControlSettings, Placement
+from mild_viz.settings import CONTROLLERS_OF, PAPER_VARIANTS, VARIANTS, ControlSettings, Placement
 from mild_viz.trial import Trial
 
 HANDSHAKE = 4
@@ -84,7 +84,7 @@ def test_alphas_are_probabilities_and_covariances_positive(model: Checkpoint, ha
         assert np.linalg.eigvalsh(covariance).min() > 0
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_commands_stay_within_the_limits(
     model: Checkpoint, robot: RobotModel, handshake: Trial, controller: str
 ) -> None:
@@ -215,7 +215,7 @@ def test_state_visits_count_stays() -> None:
 
 
 @pytest.mark.parametrize("variant", ["v3.1", "v3.2"])
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", CONTROLLERS_OF["joints"])
 def test_streaming_equals_batch(
     model: Checkpoint, robot: RobotModel, handshake: Trial, variant: str, controller: str
 ) -> None:

@@ -8,15 +8,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mild_viz.checkpoint.fields import MAX_SIZE, names, need, number, read_json, size, typed
+from mild_viz.checkpoint.fields import MAX_SIZE, names, need, number, point, read_json, size, typed
 from mild_viz.checkpoint.model import Checkpoint, RobotInterface
 from mild_viz.errors import UserError
 from mild_viz.latent.context import ContextLayout
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.robot.control.rules import ContactRules, parse_contact_rules, rules_as_json
 from mild_viz.robot.placement import Meeting
+from mild_viz.robot.workspace import Box, Workspace
 from mild_viz.settings import VARIANTS, WINDOW, Placement, choose
-from mild_viz.trial import ACTIONS
+from mild_viz.trial import ACTIONS, ARM_POINTS, HAND_POINTS
 
 SCHEMA_VERSION = 1
 
@@ -42,6 +43,7 @@ class Config:
     state_model: str
     actions: tuple[str, ...]
     robot: RobotInterface | None
+    points: tuple[str, ...]
     rate: float | None
     robot_variants: tuple[str, ...]
     """Those that have a robot VAE on the shared human side."""
@@ -51,6 +53,7 @@ class Config:
     contact_rules: dict[str, ContactRules]
     placement: Placement | None
     meeting: Meeting | None
+    workspace: Workspace | None
     training: dict[str, Any]
     metrics: dict[str, Any]
 
@@ -68,6 +71,7 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "state_model": checkpoint.state_model,
         "actions": list(checkpoint.actions),
         "robot": asdict(checkpoint.robot) if checkpoint.robot else None,
+        "points": list(checkpoint.points),
         "rate": checkpoint.rate,
         "variants": {name: asdict(VARIANTS[name]) for name in (*checkpoint.robot_vaes, *checkpoint.own_models)},
         "own_models": {
@@ -81,6 +85,7 @@ def config_of(checkpoint: Checkpoint) -> dict[str, Any]:
         "contact_rules": rules_as_json(checkpoint.contact_rules),
         "placement": asdict(checkpoint.placement) if checkpoint.placement else None,
         "meeting": asdict(checkpoint.meeting) if checkpoint.meeting else None,
+        "workspace": [asdict(box) for box in checkpoint.workspace] if checkpoint.workspace else None,
         "training": dict(checkpoint.training),
         "metrics": dict(checkpoint.metrics),
     }
@@ -185,15 +190,28 @@ def _meeting(value: Any, where: str) -> Meeting | None:
     if value is None:
         return None
     need(typed(value, dict, where), ("partner", "human", "source"), where)
-    points = {}
-    for key in ("partner", "human"):
-        points[key] = tuple(number(x, f"{where}.{key}") for x in typed(value[key], list, f"{where}.{key}"))
-        if len(points[key]) != 3:
-            raise UserError(f"{where}.{key} is {reprlib.repr(points[key])}, expected three numbers")
+    points = {key: point(value[key], f"{where}.{key}") for key in ("partner", "human")}
     try:
         return Meeting(**points, source=typed(value["source"], str, f"{where}.source"))
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
+
+
+def _workspace(value: Any, points: Sequence[str], where: str) -> Workspace | None:
+    if value is None and points != HAND_POINTS:
+        return None
+    found = typed(value, list, where)
+    if points != HAND_POINTS or len(found) != len(HAND_POINTS):
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected a box for each of {', '.join(HAND_POINTS)}")
+    boxes = []
+    for index, box in enumerate(found):
+        place = f"{where}[{index}]"
+        need(typed(box, dict, place), ("lower", "upper"), place)
+        try:
+            boxes.append(Box(*(point(box[key], f"{place}.{key}") for key in ("lower", "upper"))))
+        except UserError as error:
+            raise UserError(f"{place}: {error}") from None
+    return tuple(boxes)
 
 
 def is_config(config: Any) -> bool:
@@ -231,6 +249,10 @@ def read_config(file: Path) -> Config:
     for action in actions:
         choose(f"{file}: action", action, ACTIONS)
     robot = parse_robot(config["robot"], f"{file}: robot")
+    points = names(config.get("points", list(ARM_POINTS)), f"{file}: points")
+    if points not in (ARM_POINTS, HAND_POINTS):
+        valid = " or ".join(", ".join(known) for known in (ARM_POINTS, HAND_POINTS))
+        raise UserError(f"{file}: points is {list(points)}, expected {valid}")
     contact = parse_contact_states(config.get("contact_states", {}), actions, n_states, f"{file}: contact_states")
     variants = _variants(config["variants"], robot, f"{file}: variants")
     own_models = _own_models(config.get("own_models", {}), variants, f"{file}: own_models")
@@ -248,6 +270,7 @@ def read_config(file: Path) -> Config:
         state_model=_state_model(config.get("state_model", "hmm"), f"{file}: state_model"),
         actions=actions,
         robot=robot,
+        points=points,
         rate=_rate(config.get("rate"), f"{file}: rate"),
         robot_variants=tuple(name for name in variants if name not in own_models),
         own_models=own_models,
@@ -255,6 +278,7 @@ def read_config(file: Path) -> Config:
         own_contact_states=own_contact,
         contact_rules=parse_contact_rules(config.get("contact_rules", {}), actions, f"{file}: contact_rules"),
         placement=_placement(config.get("placement"), f"{file}: placement"),
+        workspace=_workspace(config.get("workspace"), points, f"{file}: workspace"),
         meeting=_meeting(config.get("meeting"), f"{file}: meeting"),
         training=typed(config.get("training", {}), dict, f"{file}: training"),
         metrics=typed(config.get("metrics", {}), dict, f"{file}: metrics"),

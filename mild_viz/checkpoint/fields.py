@@ -48,6 +48,14 @@ def number(value: Any, where: str) -> float:
     return float(value)
 
 
+def point(value: Any, where: str) -> tuple[float, float, float]:
+    """`value` if it is a list of three finite numbers."""
+    if len(typed(value, list, where)) != 3:
+        raise UserError(f"{where} is {reprlib.repr(value)}, expected three numbers")
+    x, y, z = (number(entry, where) for entry in value)
+    return x, y, z
+
+
 def names(value: Any, where: str) -> tuple[str, ...]:
     """`value` if it lists one name or more, each once."""
     found = tuple(typed(name, str, f"{where}: an entry") for name in typed(value, list, where))

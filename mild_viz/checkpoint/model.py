@@ -17,7 +17,9 @@ from mild_viz.latent.vae import VAE
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.control.rules import DEFAULT_RULES, ContactRules
 from mild_viz.robot.placement import Meeting
+from mild_viz.robot.workspace import Workspace
 from mild_viz.settings import VARIANTS, Placement, choose
+from mild_viz.trial import ARM_POINTS, HAND_POINTS
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Checkpoint:
     """None for a human-human model: the partner is then the second human, and the human VAE serves both."""
     own_models: Mapping[str, tuple[InteractionModel, ...]] = field(default_factory=dict)
     """By variant; all of the same actions and sizes."""
+    points: tuple[str, ...] = ARM_POINTS
+    """What it reads of the human, and of a second human (`Trial.points`)."""
     rate: float | None = None
     """Frames a second of the recordings that it was trained on [Hz]; None where that is not known."""
     contact_states: Mapping[str, frozenset[int]] = field(default_factory=dict)
@@ -61,6 +65,8 @@ class Checkpoint:
     """Where the human stands before the robot that it was trained for."""
     meeting: Meeting | None = None
     """Where the hands of two humans meet, for a model that is not of one robot."""
+    workspace: Workspace | None = None
+    """Where the second human's hands were, for a model that decodes both of them (`HAND_POINTS`)."""
     hidden: tuple[int, int] = (40, 20)
     training: Mapping[str, Any] = field(default_factory=dict)
     """The command, seed and settings that made it."""
@@ -71,6 +77,13 @@ class Checkpoint:
         """The variants that it holds; a human-human model is v1 by construction (shared weights, no robot stage)."""
         shared = tuple(self.robot_vaes) if self.robot is not None else ("v1",)
         return shared + tuple(self.own_models)
+
+    @property
+    def decodes(self) -> str:
+        """What it decodes of the partner: 'joints' of the robot, or of a second human the 'arm' or both 'hands'."""
+        if self.robot is not None:
+            return "joints"
+        return "hands" if self.points == HAND_POINTS else "arm"
 
     @property
     def default_variant(self) -> str:

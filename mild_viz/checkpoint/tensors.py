@@ -17,7 +17,7 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.state_models import STATE_MODELS
 from mild_viz.latent.transition import TransitionState, check_transition_state
 from mild_viz.latent.vae import VAE, make_vae
-from mild_viz.settings import HUMAN_FEATURES, WINDOW
+from mild_viz.settings import POINT_FEATURES, WINDOW
 
 
 def tensors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
@@ -149,8 +149,8 @@ def read_parts(tensors: Mapping[str, np.ndarray], config: Config, where: str) ->
     Raises:
         UserError: naming the tensor, what was found and what was expected.
     """
-    human_input = WINDOW * HUMAN_FEATURES
-    robot_input = WINDOW * (len(config.robot.joint_names) if config.robot else HUMAN_FEATURES)
+    human_input = WINDOW * POINT_FEATURES * len(config.points)
+    robot_input = WINDOW * len(config.robot.joint_names) if config.robot else human_input
 
     def own_model(part: str, layout: ContextLayout) -> InteractionModel:
         return InteractionModel(

@@ -29,7 +29,7 @@ from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
-from mild_viz.settings import ControlSettings, InferSettings, choose
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings, InferSettings, choose
 from mild_viz.trial import Dataset
 
 LABEL = "mild_viz"
@@ -88,7 +88,8 @@ class Dashboard:
 
     def _compare(self, rollout: Rollout, choice: Choice) -> tuple[Rollout, ...]:
         """The rollouts of the compared controllers; a few milliseconds each, in the session's worker."""
-        compared, settings = choice.view.compared, choice.settings.control
+        known, settings = CONTROLLERS_OF[choice.checkpoint.decodes], choice.settings.control
+        compared = tuple(name for name in choice.view.compared if name in known)
         return run_controllers(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings, compared)
 
     def _tick(self, frame: int, playing: bool) -> None:

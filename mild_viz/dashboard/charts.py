@@ -188,7 +188,7 @@ def _rules(rollout: Rollout) -> str:
             mask: "&#10;".join(f"{rule.name}: {escape(rule.text)}" for rule in rules) for mask, rules in fired.items()
         }
         strips.append(_strip(values, css, colors, names, hints))
-    return _lane("Rules", "safety", "".join(strips), css="mv-states mv-fired")
+    return _lane("Rules", "safety", "".join(strips), css="mv-fired")
 
 
 @lru_cache(maxsize=8)  # a control-only rerun keeps the inference

@@ -35,7 +35,8 @@ TIMELINE_CSS = """
 .mv-timeline { display: none; }
 div:has(> div > .mv-timeline) {
   display: grid; grid-template-columns: auto auto auto minmax(0, 1fr); align-items: center; height: 100%;
-  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
+  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr)
+    var(--mv-force-row,) 14px;
   padding: 2px 0 0 0 !important; box-sizing: border-box;
 }
 div:has(> div > .mv-timeline) > div { padding-bottom: 0 !important; }
@@ -61,10 +62,8 @@ div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-InputWrapper-root {
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-Slider-root { margin-inline: -3.7px; }
 div:has(> div > .mv-timeline) > div:nth-child(4) input { display: block; }
 .mv-lane { height: 100%; }
-[data-dock-root]:has(.mv-force) { --mv-height: clamp(330px, 43vh, 450px) !important; }
-div:has(> div > .mv-timeline):has(.mv-force) {
-  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) minmax(28px, 5fr) 14px;
-}
+[data-dock-root]:has(.mv-force) { --mv-height: clamp(338px, 44vh, 450px) !important; }
+div:has(> div > .mv-timeline):has(.mv-force) { --mv-force-row: minmax(28px, 5fr); }
 div:has(> div > .mv-timeline) > div:has(> .mv-force) { order: 1; }
 div:has(> div > .mv-timeline) > div:has(> .mv-axis) { order: 2; }
 """
@@ -105,8 +104,10 @@ CHART_CSS = """
   font-size: 10px; font-weight: 600; overflow: hidden; }
 .mv-states { height: 17px; }
 .mv-states.mv-with-phase { height: 29px; }
-.mv-states.mv-fired { height: 26px; }
-.mv-fired .mv-name small { margin-top: 2px; }
+.mv-fired { height: 26px; }
+.mv-fired .mv-name { align-self: flex-start; padding-top: 1px; }
+.mv-fired .mv-name small { margin-top: 2px; line-height: 11px; }
+.mv-fired .mv-plot { border-bottom: none; }
 .mv-fired .mv-strip { height: 12px; }
 .mv-safety { position: absolute; left: 0; right: 0; top: 13px; height: 12px; }
 .mv-fired .mv-segment { font-weight: 400; font-size: 9px; white-space: nowrap; box-sizing: border-box;
@@ -157,6 +158,7 @@ PANEL_CSS = """
 .mv-table th { font-weight: 500; text-align: right; vertical-align: bottom; padding: 2px 0 2px 6px; }
 .mv-table tr > th:first-child { text-align: left; white-space: nowrap; padding-left: 0; }
 .mv-table td { text-align: right; padding: 2px 0 2px 6px; border-top: 1px solid var(--mantine-color-default-border); }
+.mv-table td:first-child { text-align: left; padding-left: 0; }
 .mv-table tr + tr th { border-top: 1px solid var(--mantine-color-default-border); }
 .mv-note b { color: var(--mantine-color-text); }
 .mv-note code { font-size: 11px; }

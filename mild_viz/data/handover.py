@@ -13,6 +13,7 @@ object it is, and its shape, was not recorded.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from mild_viz.data.npz import load_npz
 from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
-from mild_viz.trial import Dataset, ObjectTrack, Skeleton, Trial
+from mild_viz.trial import HAND_POINTS, Dataset, ObjectTrack, Skeleton, Trial
 
 FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
 ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
@@ -46,6 +47,19 @@ def read_handover(root: Path) -> Dataset:
         test=tuple(read_file(paths["test"], "test")),
         checksum=file_checksum(*paths.values()),
     )
+
+
+def read_handover_hands(root: Path) -> Dataset:
+    """The same recordings, of which a model reads both hands of both people: the robot gives with two arms.
+
+    (Sec. Bimanual Robot-to-Human Handovers; there on recordings of two-handed handovers.)
+    """
+    source = read_handover(root)
+    train, test = (
+        tuple(replace(trial, dataset="handover-hands", points=HAND_POINTS) for trial in trials)
+        for trials in (source.train, source.test)
+    )
+    return replace(source, name="handover-hands", title=f"{source.title}: both hands", train=train, test=test)
 
 
 def read_file(path: Path, split: str) -> list[Trial]:

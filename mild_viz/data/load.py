@@ -71,6 +71,10 @@ def _load(name: str, root: Path) -> Dataset:
         from mild_viz.data.buetepage import read_buetepage
 
         return read_buetepage(root)
+    if name == "handover-hands":
+        from mild_viz.data.handover import read_handover_hands
+
+        return read_handover_hands(root)
     from mild_viz.data.handover import read_handover
 
     return read_handover(root)

@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.errors import UserError
+from mild_viz.trial import ARM_POINTS
 
-ARM_JOINTS = ("right_shoulder", "right_elbow", "right_wrist")
-"""The joints of `Trial.human_arm`, in its order; both body models use these names."""
+ARM_JOINTS = ARM_POINTS
+"""The joints of `Trial.human_arm`, in its order, which every body model here has."""
 
 NUITRACK_JOINTS = (
     "head", "neck", "torso", "waist",

@@ -29,6 +29,17 @@ class Source:
     """How to get the files that have no `url`."""
 
 
+HANDOVERS = Source(
+    (DataFile(Path("handover/train.npz")), DataFile(Path("handover/test.npz"))),
+    by_hand=(
+        "Its source, the GitHub repository hyeonseong-kim98/dynamic_handover_dataset, publishes one Python pickle "
+        "a motion, which mild_viz does not open; no place is known that publishes the two .npz files, so there is "
+        "neither an address nor a checksum to trust. Convert the motions yourself, into arrays receiver and giver "
+        "(N, 34, 3) [m] in ZED body-34 order, offsets (first frame of each trial, then N) and rate_hz, and place "
+        "them at"
+    ),
+)
+
 SOURCES: dict[str, Source] = {
     "demo": Source(()),
     "nuisi": Source(
@@ -62,16 +73,8 @@ SOURCES: dict[str, Source] = {
             ),
         )
     ),
-    "handover": Source(
-        (DataFile(Path("handover/train.npz")), DataFile(Path("handover/test.npz"))),
-        by_hand=(
-            "Its source, the GitHub repository hyeonseong-kim98/dynamic_handover_dataset, publishes one Python pickle "
-            "a motion, which mild_viz does not open; no place is known that publishes the two .npz files, so there is "
-            "neither an address nor a checksum to trust. Convert the motions yourself, into arrays receiver and giver "
-            "(N, 34, 3) [m] in ZED body-34 order, offsets (first frame of each trial, then N) and rate_hz, and place "
-            "them at"
-        ),
-    ),
+    "handover": HANDOVERS,
+    "handover-hands": HANDOVERS,
     "buetepage": Source(
         (DataFile(Path("buetepage/traj_data.npz")),),
         by_hand=(

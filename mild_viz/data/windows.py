@@ -36,13 +36,13 @@ def fill_gaps(positions: Float[np.ndarray, "T ..."], max_gap: int) -> Float[np.n
     return filled
 
 
-def human_features(arm: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 18"]:
-    """Per frame: 9 positions (shoulder, elbow, wrist) [m], then their 9 velocities.
+def human_features(points: Float[np.ndarray, "T P 3"]) -> Float[np.ndarray, "T F"]:
+    """Per frame: the positions of a person's P points (an arm: shoulder, elbow, wrist) [m], then their velocities.
 
     A velocity is the difference to the previous frame (metres a frame, not a second; 0 in the first frame),
     as the authors take it. It is NaN beside a missing frame.
     """
-    positions = arm.reshape(len(arm), 9)
+    positions = points.reshape(len(points), -1)
     velocities = np.diff(positions, axis=0, prepend=positions[:1])
     velocities[:1] = 0.0
     return np.concatenate([positions, velocities], axis=1)
@@ -62,14 +62,14 @@ def windows(features: Float[np.ndarray, "T F"]) -> Float[np.ndarray, "N FW"]:
     return rows
 
 
-def human_windows(arm: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "N 90"]:
-    """Windows of `human_features`, N = T - 4."""
-    return windows(human_features(arm))
+def human_windows(points: Float[np.ndarray, "T P 3"]) -> Float[np.ndarray, "N FW"]:
+    """Windows of `human_features`, N = T - 4; 90 columns for an arm."""
+    return windows(human_features(points))
 
 
 def pair_windows(
-    human: Float[np.ndarray, "T 3 3"], robot: Float[np.ndarray, "T J"]
-) -> tuple[Float[np.ndarray, "N 90"], Float[np.ndarray, "N JW"]]:
+    human: Float[np.ndarray, "T P 3"], robot: Float[np.ndarray, "T J"]
+) -> tuple[Float[np.ndarray, "N FW"], Float[np.ndarray, "N JW"]]:
     """The pairs that a model is trained and measured on: N = T - 9.
 
     Row n of the first holds human frames n to n + 4, row n of the second the robot frames n + 5 to n + 9

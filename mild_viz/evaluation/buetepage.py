@@ -23,13 +23,14 @@ from jaxtyping import Float
 from scipy.special import expit
 
 from mild_viz.checkpoint import CONFIG, Checkpoint, RobotInterface, load_checkpoint
-from mild_viz.checkpoint.config import SCHEMA_VERSION, parse_robot, read_json
+from mild_viz.checkpoint.config import SCHEMA_VERSION, parse_robot
+from mild_viz.checkpoint.fields import read_json
 from mild_viz.checkpoint.folder import WEIGHTS, load_tensors, save_folder
 from mild_viz.errors import UserError
 from mild_viz.latent.vae import VAE, checked_tensors, make_vae
 from mild_viz.pairs import Windows
-from mild_viz.settings import HUMAN_FEATURES, WINDOW, choose
-from mild_viz.trial import ACTIONS
+from mild_viz.settings import ARM_FEATURES, WINDOW, choose
+from mild_viz.trial import ACTIONS, ARM_POINTS
 
 BUETEPAGE = "buetepage"
 """Name of the model in tables, and `kind` in its config.json."""
@@ -102,6 +103,9 @@ class Buetepage:
     training: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
+    points = ARM_POINTS
+    """What it reads of the human."""
+
     @property
     def variants(self) -> tuple[str, ...]:
         """What it is called in a table of errors."""
@@ -147,7 +151,7 @@ def predict_windows(model: Buetepage, data: Windows) -> Float[np.ndarray, "R Y"]
     for trial, action in enumerate(data.actions):
         rows = np.arange(len(observed))[data.rows(trial)]
         rows = rows[observed[rows]]
-        predicted[rows] = model.predict(action, data.human[rows, -HUMAN_FEATURES:])
+        predicted[rows] = model.predict(action, data.human[rows, -ARM_FEATURES:])
     return predicted
 
 
@@ -155,7 +159,7 @@ def dynamics_shapes(n_actions: int, n_joints: int | None) -> dict[str, tuple[int
     """Shape of every tensor of the dynamics; `n_joints` is None where the partner is a human."""
     gates = 4 * LSTM_SIZE
     shapes: dict[str, tuple[int, ...]] = {
-        "human_lstm.input_weight": (gates, HUMAN_FEATURES + n_actions),
+        "human_lstm.input_weight": (gates, ARM_FEATURES + n_actions),
         "human_lstm.recurrent_weight": (gates, LSTM_SIZE),
         "human_lstm.bias": (gates,),
         "latent_mean.weight": (DYNAMICS_LATENT_SIZE, LSTM_SIZE),
@@ -243,7 +247,7 @@ def load_buetepage(path: Path) -> Buetepage:
     tensors = load_tensors(weights)
     of_vae = {name.removeprefix("vae/"): tensor for name, tensor in tensors.items() if name.startswith("vae/")}
     n_joints = len(robot.joint_names) if robot else None
-    input_size = WINDOW * (HUMAN_FEATURES if n_joints is None else n_joints)
+    input_size = WINDOW * (ARM_FEATURES if n_joints is None else n_joints)
     return Buetepage(
         path=path,
         name=config["name"],

@@ -15,13 +15,10 @@ from mild_viz.pipeline import control, infer
 from mild_viz.robot.contact import contact_frames
 from mild_viz.robot.model import RobotModel
 from mild_viz.settings import ControlSettings
-from mild_viz.trial import Trial
+from mild_viz.trial import WRIST, Trial
 
 COMPARED = ("mild", "mild-ik")
 """Controllers whose distance in contact is measured: without inverse kinematics, and with it."""
-
-WRIST = slice(6, 9)
-"""The wrist's position among the features of a frame (shoulder, elbow, wrist, then their velocities)."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,8 @@ def hand_error(passes: Sequence[Pass], robot: RobotModel | None) -> HandError | 
 def _hand_distance(one: Pass, robot: RobotModel | None) -> Float[np.ndarray, " K"]:
     predicted, truth = (one.first_frame(windows[one.known]) for windows in (one.predicted, one.truth))
     if one.human_human:
-        return np.linalg.norm(predicted[:, WRIST] - truth[:, WRIST], axis=1)
+        first = 3 * one.trial.points.index(WRIST)
+        return np.linalg.norm((predicted - truth)[:, first : first + 3], axis=1)
     if robot is None:
         raise UserError(f"trial {one.trial.name}: the description of the robot is needed for its end effector")
     return np.linalg.norm(robot.end_effector(predicted) - robot.end_effector(truth), axis=1)

@@ -31,7 +31,7 @@ from mild_viz.evaluation.runs import MEAN, OverRuns, over_checkpoints, over_reco
 from mild_viz.evaluation.significance import Comparison, compare
 from mild_viz.evaluation.tables import TextTable, print_tables, to_latex, to_markdown
 from mild_viz.files import write_atomically
-from mild_viz.pairs import check_rate, stack_windows
+from mild_viz.pairs import check_points, check_rate, stack_windows
 from mild_viz.settings import choose
 from mild_viz.trial import Dataset
 
@@ -120,6 +120,7 @@ def measure(checkpoints: Mapping[str, Model], dataset: Dataset, pairs: Sequence[
     joints = joint_names(models[0][1])
     for name, model in models:
         check_rate(model.rate, name, dataset.test)
+        check_points(model.points, name, dataset.test)
         if joint_names(model) != joints:
             said = [", ".join(joint_names(m) or ["the second human's arm"]) for m in (models[0][1], model)]
             raise UserError(

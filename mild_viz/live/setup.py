@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
+from mild_viz.errors import UserError
 from mild_viz.live.address import parse
 from mild_viz.live.config import LiveConfig
 from mild_viz.live.controller import LiveController
@@ -19,7 +20,7 @@ from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import T_world_human, outstretched_placement
 from mild_viz.settings import ControlSettings, Placement, choose
 from mild_viz.streaming import StreamModel, start, step, stream_model
-from mild_viz.trial import Trial
+from mild_viz.trial import ARM_POINTS, Trial
 
 NOMINAL_ARM = np.array([[0.0, -0.18, 0.0], [0.03, -0.20, -0.28], [0.12, -0.20, -0.52]])
 """Shoulder, elbow and wrist of an adult whose arm hangs [m], where a model knows nobody's."""
@@ -28,7 +29,16 @@ NOMINAL_ARM = np.array([[0.0, -0.18, 0.0], [0.03, -0.20, -0.28], [0.12, -0.20, -
 def live_model(
     checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel, settings: ControlSettings, config: LiveConfig
 ) -> StreamModel:
-    """The model that live operation runs, at its own rate. Raises UserError for a variant or action it lacks."""
+    """The model that live operation runs, at its own rate.
+
+    Raises:
+        UserError: for a variant or action that it lacks, or a model that reads other points than an arm.
+    """
+    if checkpoint.points != ARM_POINTS:
+        raise UserError(
+            f"checkpoint {checkpoint.name} reads {', '.join(checkpoint.points)} of the human; valid for live "
+            f"operation: a model that reads {', '.join(ARM_POINTS)}"
+        )
     rate = checkpoint.rate or UNKNOWN_RATE
     settings = replace(settings, watch=config.watch)
     placement = live_placement(checkpoint, robot, settings)

@@ -21,8 +21,9 @@ from mild_viz.errors import UserError
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import arm_length, contact_frames, in_frame, upright
 from mild_viz.robot.retarget_arm import hand_place, scaled_wrist
+from mild_viz.robot.workspace import HandMap
 from mild_viz.settings import MAX_PLACEMENT, Placement
-from mild_viz.trial import Trial
+from mild_viz.trial import WRIST, Trial
 
 FACING = np.diag([-1.0, -1.0, 1.0])
 """Rotation of a person who faces the robot: yaw of pi."""
@@ -168,7 +169,7 @@ def T_world_human(
 
 
 @lru_cache(maxsize=1024)  # the pipeline asks at every rerun; trials are immutable and kept by their dataset
-def recorded_placement(chain: ArmChain, trial: Trial) -> PlacedHuman | None:
+def recorded_placement(chain: ArmChain, trial: Trial, follow: HandMap | None = None) -> PlacedHuman | None:
     """The human as recorded, with the robot in the partner's place; None without one world frame.
 
     The orientation is the recorded one, seen from the partner's heading (the robot stands upright). The
@@ -180,7 +181,7 @@ def recorded_placement(chain: ArmChain, trial: Trial) -> PlacedHuman | None:
         return None
     stands = upright(world_partner)
     human_rotation, partner_rotation = stands @ world_human[:3, :3], stands @ world_partner[:3, :3]
-    sample = _meetings(chain, trial, human_rotation, partner_rotation)
+    sample = _meetings(chain, trial, human_rotation, partner_rotation, follow)
     if len(sample.points):
         translation = fit_translation([sample]).translation
     else:
@@ -208,14 +209,19 @@ def outstretched_placement(chain: ArmChain, trial: Trial) -> Placement:
 
 
 def place_human(
-    chain: ArmChain, trial: Trial, chosen: Placement | None = None, stored: Placement | None = None
+    chain: ArmChain,
+    trial: Trial,
+    chosen: Placement | None = None,
+    stored: Placement | None = None,
+    follow: HandMap | None = None,
 ) -> PlacedHuman:
     """Where the human of this trial stands: as chosen, else as recorded, else as stored with the model.
 
     A chosen placement moves the human but keeps the recorded orientation. Without any of the three, both
-    arms are assumed to be stretched out.
+    arms are assumed to be stretched out. `follow` says where the robot's hands are if they follow the partner's;
+    without it, its hand keeps the partner's fraction of reach.
     """
-    recorded = recorded_placement(chain, trial)
+    recorded = recorded_placement(chain, trial, follow)
     if chosen is not None:
         rotation = FACING if recorded is None else recorded.T_world_human[:3, :3]
         return PlacedHuman(T_world_human(chain, chosen, rotation), chosen)
@@ -226,7 +232,11 @@ def place_human(
 
 
 def _meetings(
-    chain: ArmChain, trial: Trial, human_rotation: Float[np.ndarray, "3 3"], partner_rotation: Float[np.ndarray, "3 3"]
+    chain: ArmChain,
+    trial: Trial,
+    human_rotation: Float[np.ndarray, "3 3"],
+    partner_rotation: Float[np.ndarray, "3 3"],
+    follow: HandMap | None = None,
 ) -> Sample:
     """For every contact frame: where the human's frame must be for the hands to meet.
 
@@ -235,7 +245,11 @@ def _meetings(
     if trial.partner_arm is None:
         return Sample(np.empty((0, 3)), np.empty((0, 3, 3)))
     touching = contact_frames(trial)
-    meeting = scaled_wrist(chain, trial.partner_arm, partner_rotation)[touching]
+    if follow is None:
+        meeting = scaled_wrist(chain, trial.partner_arm, partner_rotation)[touching]
+    else:
+        hands = np.asarray(trial.partner_points)
+        meeting = follow(hands[touching])[:, trial.points.index(WRIST)]
     along = meeting - chain.shoulder
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     weights = DIRECTION**2 * np.eye(3) + (1.0 - DIRECTION**2) * along[:, :, None] * along[:, None, :]

@@ -20,7 +20,14 @@ def shipped_robots() -> dict[str, RobotSpec]:
 ROBOTS = shipped_robots()
 """What `--robot NAME` stands for."""
 
-DATASET_ROBOTS = {"demo": "pepper", "nuisi": "pepper", "buetepage": "pepper", "yumi": "yumi", "handover": "panda"}
+DATASET_ROBOTS = {
+    "demo": "pepper",
+    "nuisi": "pepper",
+    "buetepage": "pepper",
+    "yumi": "yumi",
+    "handover": "panda",
+    "handover-hands": "kobo",
+}
 """The robot that a dataset's models are trained for: the recorded one, else the one that the partner's arm suits."""
 
 

@@ -8,19 +8,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Int
 
 from mild_viz.checkpoint import Checkpoint, save_checkpoint
+from mild_viz.data.windows import fill_gaps, human_windows, max_gap
 from mild_viz.errors import UserError
 from mild_viz.evaluation.metrics import Row, model_rows
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.pairs import stack_windows
-from mild_viz.pipeline import NEWEST, infer
+from mild_viz.pipeline import NEWEST
+from mild_viz.prediction import predict
 from mild_viz.robot.contact import contact_frames, suggest_contact_states
 from mild_viz.robot.model import load_robot
 from mild_viz.robot.placement import estimate_meeting, estimate_placement
-from mild_viz.settings import VARIANTS
+from mild_viz.robot.workspace import measure_workspace
+from mild_viz.settings import VARIANTS, WINDOW
 from mild_viz.training.transition import learn_transition_states
-from mild_viz.trial import Trial
+from mild_viz.trial import HAND_POINTS, Trial
 
 if TYPE_CHECKING:
     from mild_viz.training.run import Plan
@@ -124,6 +128,8 @@ def _with_contact(checkpoint: Checkpoint, fitted: InteractionModel, plan: Plan) 
         own_models=own_models,
         own_contact_states=own_states,
     )
+    if checkpoint.points == HAND_POINTS:
+        checkpoint = replace(checkpoint, workspace=measure_workspace(plan.source.train))
     touching = [trial for trial in plan.source.train if contact_frames(trial).any()]
     if not touching:
         return checkpoint
@@ -137,13 +143,19 @@ def contact_states(checkpoint: Checkpoint, variant: str, trials: Sequence[Trial]
     result = {}
     for action in checkpoint.actions:
         of_action = [trial for trial in trials if trial.action == action]
-        active = [infer(checkpoint, trial, variant).active_state for trial in of_action]
+        active = [_active_states(checkpoint, variant, trial) for trial in of_action]
         touching = [
             contact_frames(trial)[NEWEST : NEWEST + len(states)]
             for trial, states in zip(of_action, active, strict=True)
         ]
         result[action] = suggest_contact_states(active, touching, checkpoint.n_states)
     return result
+
+
+def _active_states(checkpoint: Checkpoint, variant: str, trial: Trial) -> Int[np.ndarray, " N"]:
+    """The active state of every window, as `pipeline.infer` gives it for any robot."""
+    windows = human_windows(fill_gaps(trial.human_points, max_gap(trial.rate)))[:-WINDOW]
+    return predict(checkpoint, variant, trial.action, windows).log_alpha.argmax(1)
 
 
 def readme(checkpoint: Checkpoint, title: str, path: Path) -> str:

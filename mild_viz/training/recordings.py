@@ -46,7 +46,7 @@ def check_trial(trial: Trial) -> None:
             f"trial {trial.name} has {trial.n_frames} frames, which is less than two windows; expected at least "
             f"{MIN_FRAMES}: leave it out of the recordings"
         )
-    for name in ("human_arm", "partner_arm", "robot_joints"):
+    for name in ("human_points", "partner_points", "robot_joints"):
         values = getattr(trial, name)
         if values is None:
             continue

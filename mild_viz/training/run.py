@@ -28,7 +28,7 @@ from mild_viz.training.progress import HeldOut, shown
 from mild_viz.training.recordings import check_trial, training_windows
 from mild_viz.training.robot_stage import train_robot_stage
 from mild_viz.training.state import RunState
-from mild_viz.trial import Dataset, Trial
+from mild_viz.trial import ARM_POINTS, Dataset, Trial
 
 
 def hold_out(trials: Sequence[Trial], n_held: int, fold: int = -1) -> tuple[list[Trial], list[Trial]]:
@@ -114,7 +114,13 @@ def plan_run(
     rates = sorted({trial.rate for trial in source.train + source.test})
     if len(rates) > 1:
         raise UserError(f"dataset '{dataset}' has trials of different rates: {rates} Hz; expected one rate")
-    if stage == "hhi" and source.train[0].partner_arm is None:
+    first = source.train[0]
+    if stage == "hri" and first.points != ARM_POINTS:
+        raise UserError(
+            f"dataset '{dataset}' gives {', '.join(first.points)}, which a robot follows without a decoder of its own; "
+            "valid for it: --stage hhi"
+        )
+    if stage == "hhi" and first.partner_points is None:
         raise UserError(f"dataset '{dataset}' has no second human; valid for it: --stage hri")
     robot = None
     if stage == "hri":
@@ -245,6 +251,7 @@ def _candidate(
         robot_vaes=robot_vaes,
         robot=plan.robot,
         own_models=own_models,
+        points=plan.source.train[0].points,
         rate=plan.rate,
         contact_rules={action: DEFAULT_RULES[action] for action in human.hmms},
         hidden=plan.options.hidden,

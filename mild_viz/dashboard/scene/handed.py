@@ -22,7 +22,8 @@ from mild_viz.rollout import Rollout
 ROOT = "/object"
 
 RADIUS, HEIGHT = 0.04, 0.20
-"""Size [m] of the bottle that is drawn, below the tracked point: the cylinder that the recording's own viewer draws."""
+"""Size [m] of the bottle that is drawn, below the tracked point. The object's own was not recorded; the recording's own
+viewer draws a cylinder of this radius whose middle is 10 cm below that point."""
 
 GRIP = 0.15
 """How far below the tracked point the giver's hand is [m]: 0.17 over the training trials, the receiver's 0.12."""

@@ -16,7 +16,7 @@ from mild_viz.evaluation.buetepage import (
     LSTM_SIZE,
     ROBOT_LAYERS,
 )
-from mild_viz.settings import HUMAN_FEATURES
+from mild_viz.settings import ARM_FEATURES
 
 MIN_STD = 1e-4
 """Added to every standard deviation."""
@@ -164,7 +164,7 @@ def with_code(offset: Tensor, scale: Tensor, n_others: int) -> tuple[Tensor, Ten
 
 def human_inputs(windows: np.ndarray) -> np.ndarray:
     """The newest frame of every human window (R, 90): (R, 18)."""
-    return windows[:, -HUMAN_FEATURES:]
+    return windows[:, -ARM_FEATURES:]
 
 
 def _array(tensor: Tensor) -> np.ndarray:

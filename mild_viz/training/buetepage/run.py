@@ -17,6 +17,7 @@ from mild_viz.errors import UserError
 from mild_viz.evaluation.buetepage import BUETEPAGE, Buetepage, save_buetepage
 from mild_viz.evaluation.metrics import model_rows
 from mild_viz.latent.vae import VAE
+from mild_viz.pairs import check_points
 from mild_viz.training.buetepage.options import BuetepageOptions
 from mild_viz.training.buetepage.stages import (
     make_examples,
@@ -29,7 +30,7 @@ from mild_viz.training.outcome import mean_error
 from mild_viz.training.progress import Progress, shown
 from mild_viz.training.recordings import training_windows
 from mild_viz.training.run import plan_run
-from mild_viz.trial import Dataset, Trial
+from mild_viz.trial import ARM_POINTS, Dataset, Trial
 
 HUMAN_STAGES = ("human VAE", "human dynamics")
 STAGES = (*HUMAN_STAGES, "robot VAE", "robot dynamics")
@@ -54,6 +55,7 @@ def train_buetepage(
         options = replace(options, epochs=epochs)
     check_checkpoint_target(out)
     plan = plan_run(dataset, "hhi" if human_human else "hri", ("v1",), TrainingOptions(seeds=seeds, seed=seed))
+    check_points(ARM_POINTS, "of the baseline", plan.source.train)
     source, fit, held, robot = plan.source, plan.fit, plan.held, None if human_human else plan.robot
     actions = tuple(action for action in source.actions if any(trial.action == action for trial in fit))
     started = time.monotonic()
