@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import time
 from dataclasses import replace
@@ -18,6 +19,7 @@ from mild_viz.live.controller import LiveController
 from mild_viz.live.loop import FAULT, LiveLoop, Tick
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
+from mild_viz.live.priority import CONTROL, real_time
 from mild_viz.live.setup import make_guard, warm_up
 from mild_viz.streaming import StreamModel
 
@@ -162,6 +164,22 @@ def test_no_garbage_is_collected_while_interacting(model: StreamModel, frames: l
     assert INTERACTING in phases and INTERACTING not in collections
     assert len(collections) >= 2, "before, and after the interaction"
     assert gc.isenabled() and sys.getswitchinterval() == interval
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="the system has no such priorities")
+def test_priority_is_raised_where_we_may_and_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = os.sched_getscheduler(0)
+    with real_time(CONTROL) as raised:
+        now = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        assert now == (os.SCHED_FIFO if raised else before)
+    assert os.sched_getscheduler(0) == before
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with real_time(CONTROL) as raised:
+        assert not raised and os.sched_getscheduler(0) == before
 
 
 def test_it_stops_when_told_and_after_its_time(model: StreamModel, frames: list[Observation]) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +20,7 @@ from mild_viz.live.latency import Latency
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
 from mild_viz.live.outputs import Output
+from mild_viz.live.priority import CONTROL, real_time
 from mild_viz.robot.control.rules import fired_rules
 
 log = logging.getLogger(__name__)
@@ -193,9 +192,6 @@ def tidy(phase: str) -> None:
 SWITCH = 5e-4
 """For how long another thread of this process may keep the interpreter while the control thread wants it [s]."""
 
-PRIORITY = -10
-"""Of the control thread, where the system lets us raise it (root, or a limit that an administrator set)."""
-
 
 @contextmanager
 def steady() -> Iterator[None]:
@@ -206,21 +202,10 @@ def steady() -> Iterator[None]:
     gc.disable()
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH)
-    priority = _priority()
-    _set_priority(PRIORITY)
     try:
-        yield
+        with real_time(CONTROL):
+            yield
     finally:
-        _set_priority(priority)
         sys.setswitchinterval(interval)
         gc.enable()
         gc.unfreeze()
-
-
-def _priority() -> int:
-    return os.getpriority(os.PRIO_PROCESS, 0) if hasattr(os, "getpriority") else 0
-
-
-def _set_priority(value: int) -> None:
-    with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, 0, value)  # on Linux of this thread alone

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mild_viz.live.loop import Tick
+from mild_viz.live.priority import HELPER, real_time
 from mild_viz.live.session import open_session_file, tick_record, to_line
 
 QUEUED = 600
@@ -51,6 +52,10 @@ class Recorder:
         self._thread.join(timeout=5.0)
 
     def _work(self) -> None:
+        with real_time(HELPER):
+            self._record()
+
+    def _record(self) -> None:
         names, synced = None, time.monotonic()
         try:
             while (tick := self._queue.get()) is not None:
