@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,6 +34,9 @@ def dashboard(session: Path) -> Iterator[Dashboard]:
     dashboard = open_dashboard(session=session, port=port)
     assert dashboard.session.wait_idle() and dashboard.session.error is None
     yield dashboard
+    for thread in threading.enumerate():
+        if thread.name == "mild_viz datasets":  # it completes the list of datasets in the page: not after its end
+            thread.join()
     dashboard.stop()
 
 
