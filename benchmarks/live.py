@@ -75,9 +75,7 @@ def watching(url: str | None):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(url)
-        page.wait_for_function(
-            "() => (window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0) > 3", timeout=60_000
-        )
+        page.wait_for_function("() => (window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0) > 3", timeout=60_000)
         yield
         browser.close()
 

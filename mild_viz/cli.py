@@ -25,6 +25,7 @@ from mild_viz.run_options import (
     documented,
     leave,
 )
+from mild_viz.simulate_command import simulate
 from mild_viz.train_commands import sweep, train, train_baseline
 
 
@@ -39,6 +40,7 @@ def app(
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
+    session: OptionalPath = None,
 ) -> None:
     """Start the dashboard; stop it with Ctrl-C.
 
@@ -66,6 +68,9 @@ def app(
             everybody on the network may use the page. Example: --host 0.0.0.0
         port: TCP port to listen on. Example: --port 9000
         open_browser: Also open the page in this machine's browser.
+        session: Live session to look at, as recorded by: mild-viz live --record. It brings its own model and robot;
+            its interactions are the trials, shown exactly as they were until a setting is changed.
+            Example: --session session.jsonl
     """
     from mild_viz.dashboard.app import run
 
@@ -80,6 +85,7 @@ def app(
         host=host,
         port=port,
         open_browser=open_browser,
+        session=session,
     )
 
 
@@ -209,6 +215,7 @@ COMMANDS = {
     "live": live,
     "rollout": rollout,
     "record": record,
+    "simulate": simulate,
     "import-published": import_published,
 }
 

@@ -62,7 +62,7 @@ def live(
 
     Args:
         run: What to run.
-        input: Where skeleton frames come from: udp://HOST:PORT and ws://HOST:PORT to listen on, rosbridge://HOST:PORT
+        input: Where skeleton frames come from: udp://HOST:PORT to listen on, ws://HOST:PORT or rosbridge://HOST:PORT
             to connect to, or replay:DATASET/TRIAL, which begins with a second of rest (?rest=SECONDS).
             Example: --input udp://0.0.0.0:9870
         output: Where joint commands go: udp://HOST:PORT, ws://HOST:PORT to listen on, rosbridge://HOST:PORT, csv:FILE

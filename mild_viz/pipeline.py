@@ -20,14 +20,14 @@ from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
-from mild_viz.robot.contact import in_frame
+from mild_viz.robot.contact import in_frame, nearest_wrists
 from mild_viz.robot.control.controller import Frames, make_controller
 from mild_viz.robot.control.other_arm import move_other_arms
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import CONTROLLERS_OF, WINDOW, ControlSettings, choose
-from mild_viz.trial import WRIST, Skeleton, Trial
+from mild_viz.trial import WRIST, Trial
 
 NEWEST = WINDOW - 1
 """Row n of a rollout belongs to the window whose newest observation is frame n + NEWEST."""
@@ -91,7 +91,10 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         robot_state_covariances=hmm.emission_covariances[:, partner, partner],
         human_arm=trial.human_arm[newest],
         human_hand=points[newest, checkpoint.points.index(WRIST)],
-        human_skeleton=_rows_of(trial.human_skeleton, newest),
+        human_skeleton=None if trial.human_skeleton is None else trial.human_skeleton.rows(newest),
+        partner_skeleton=None if trial.partner_skeleton is None else trial.partner_skeleton.rows(newest),
+        object_track=None if trial.object_track is None else trial.object_track.rows(newest),
+        transfer=transfer_row(trial, n_windows),
         phase=None if trial.phase is None else trial.phase[newest],
         decodes=checkpoint.decodes,
         partner_decoded=moved.partner,
@@ -167,8 +170,17 @@ def control(
         state_occupancy=occupancy,
         contact_states=settings.contact_states or frozenset(),
         placement=placed.placement,
+        T_world_partner=partner_pose(trial, placed.T_world_human),
+        object_track=None if inference.object_track is None else inference.object_track.seen_from(placed.T_world_human),
         other_arms=others,
     )
+
+
+def partner_pose(trial: Trial, T_robot_human: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"] | None:
+    """Where the recorded partner stands, with the human where the robot has it; None without one world frame."""
+    if trial.T_world_human is None or trial.T_world_partner is None:
+        return None
+    return T_robot_human @ np.linalg.inv(trial.T_world_human) @ trial.T_world_partner
 
 
 def with_contact_states(
@@ -198,5 +210,7 @@ def state_visits(
     return steps / np.maximum(visits, 1) / rate, steps / len(active)
 
 
-def _rows_of(skeleton: Skeleton | None, rows: slice) -> Skeleton | None:
-    return None if skeleton is None else Skeleton(skeleton.joint_names, skeleton.bones, skeleton.positions[rows])
+def transfer_row(trial: Trial, n_windows: int) -> int | None:
+    """The window whose newest observation is that of the transfer; None where no object or no world was recorded."""
+    frame = None if trial.object_track is None else nearest_wrists(trial)
+    return None if frame is None else min(max(frame - NEWEST, 0), n_windows - 1)

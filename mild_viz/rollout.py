@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from mild_viz.files import write_atomically
 from mild_viz.settings import Placement
-from mild_viz.trial import Skeleton, freeze_arrays
+from mild_viz.trial import ObjectTrack, Skeleton, freeze_arrays
 
 SAVED = (
     "time", "log_alpha_human", "log_alpha_joint", "log_alpha_unobserved", "active_state", "log_transition",
@@ -78,6 +78,12 @@ class Inference:
     """The wrist as the controller sees it: gaps filled by the last observation."""
     human_skeleton: Skeleton | None = None
     """The whole body at the newest observations, human frame, where it was recorded."""
+    partner_skeleton: Skeleton | None = None
+    """The same of the second human, in that person's own frame."""
+    object_track: ObjectTrack | None = None
+    """What is handed over at the newest observations, human frame, where it was recorded."""
+    transfer: int | None = None
+    """Row at which it is handed over: the two persons' wrists are nearest."""
     phase: Int[np.ndarray, " N"] | None = None
     decodes: str = "joints"
     """What the model decodes of the partner: a key of `ERROR_UNITS`."""
@@ -173,7 +179,10 @@ class Rollout:
     contact_states: frozenset[int]
     placement: Placement
     """Where the human stands, and in words for the page where that comes from."""
-
+    T_world_partner: Float[np.ndarray, "4 4"] | None = None
+    """Pose of the recorded second human's own frame; None where each person was recorded apart."""
+    object_track: ObjectTrack | None = None
+    """What is handed over as it was recorded, world."""
     other_arms: tuple[OtherArm, ...] = ()
     """The arms that move beside the one that interacts; those that only rest are not among them."""
 

@@ -59,6 +59,36 @@ class Skeleton:
                 raise UserError(f"the skeleton has no joint '{name}'; it has: {', '.join(self.joint_names)}")
         return self.positions[:, [self.joint_names.index(name) for name in names]]
 
+    def rows(self, rows: slice) -> Skeleton:
+        """Some of its frames."""
+        return Skeleton(self.joint_names, self.bones, self.positions[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTrack:
+    """Pose over time of an object that is handed over, NaN where it was not tracked; a trial's in the human's frame."""
+
+    positions: Float[np.ndarray, "T 3"]
+    """The tracked point of the object [m]."""
+    wxyzs: Float[np.ndarray, "T 4"]
+    """Unit quaternions: the object's own frame in the human's."""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def seen_from(self, T_frame_human: Float[np.ndarray, "4 4"]) -> ObjectTrack:
+        """The same track in another frame, in which the human's own has the given pose."""
+        from scipy.spatial.transform import Rotation  # slow to import, and few recordings have an object
+
+        wxyzs, known = self.wxyzs.copy(), np.isfinite(self.wxyzs).all(axis=1)
+        turned = Rotation.from_matrix(T_frame_human[:3, :3]) * Rotation.from_quat(wxyzs[known][:, [1, 2, 3, 0]])
+        wxyzs[known] = turned.as_quat()[:, [3, 0, 1, 2]]
+        return ObjectTrack(self.positions @ T_frame_human[:3, :3].T + T_frame_human[:3, 3], wxyzs)
+
+    def rows(self, rows: slice) -> ObjectTrack:
+        """Some of its frames."""
+        return ObjectTrack(self.positions[rows], self.wxyzs[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Trial:
@@ -85,6 +115,8 @@ class Trial:
     T_world_human: Float[np.ndarray, "4 4"] | None = None
     """Pose of the human's own frame in one world frame; None where each person was recorded apart."""
     T_world_partner: Float[np.ndarray, "4 4"] | None = None
+    object_track: ObjectTrack | None = None
+    """What is handed over, where it was recorded."""
     phase: Int[np.ndarray, " T"] | None = None
     """True phase of every frame (index into `PHASES`), where it is known."""
     active: Int[np.ndarray, " T"] | None = None
@@ -100,6 +132,11 @@ class Trial:
             value = getattr(self, label)
             if value is not None and len(value) != n_frames:
                 raise UserError(f"trial {self.name}: {label} has {len(value)} frames, human_arm has {n_frames}")
+        if self.object_track is not None and len(self.object_track.positions) != n_frames:
+            raise UserError(
+                f"trial {self.name}: object_track has {len(self.object_track.positions)} frames, "
+                f"human_arm has {n_frames}"
+            )
         freeze_arrays(self)
 
     @property

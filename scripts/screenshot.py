@@ -40,7 +40,7 @@ class Options:
     """Model to show. Default: the one that ships for the dataset."""
     at: float = 0.5
     """Moment to show, as a fraction of the trial."""
-    tab: Literal["Trial", "Robot", "States", "View", "Record"] = "States"
+    tab: Literal["Trial", "Robot", "States", "Force", "View", "Record"] = "States"
     camera: str = "both"
     size: tuple[str, ...] = ("1280x720",)
     theme: tuple[Literal["light", "dark"], ...] = ("light",)

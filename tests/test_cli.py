@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -45,9 +45,14 @@ def test_help_explains_every_option(command: str, capsys: pytest.CaptureFixture[
     function = cli.DATA_COMMANDS[command.split()[1]] if command.startswith("data ") else cli.COMMANDS[command]
     options = dict.fromkeys(inspect.signature(function).parameters, function)
     if options.pop("run", None):
-        options |= {field.name: run_options.RunOptions for field in dataclasses.fields(run_options.RunOptions)}
+        group = get_type_hints(function)["run"]
+        options |= {field.name: group for field in dataclasses.fields(group)}
+    if "trials" in options:
+        del options["trial"]  # it stands for it
     for name, source in options.items():
-        found = re.search(rf"^ {{4,8}}{name}: (.+)$", inspect.cleandoc(source.__doc__ or ""), re.MULTILINE)
+        docs = [one.__doc__ or "" for one in (source.__mro__ if isinstance(source, type) else (source,))]
+        text_of = "\n".join(inspect.cleandoc(doc) for doc in docs)  # options are inherited, and so is their help
+        found = re.search(rf"^ {{4,8}}{name}: (.+)$", text_of, re.MULTILINE)
         assert found, f"{command}: {name} is not documented"
         sentence = " ".join(found[1].split())
         assert sentence in text or sentence.rstrip(".") in text

@@ -57,7 +57,7 @@ def plain_loop(chain: ArmChain, settings: ControlSettings, action: str, log_alph
         if settings.controller == "base-ik":
             new = chain.rest if previous is None else previous
             if seen:
-                new = solve_ik(chain, target[None], new[None], settings.lambda_x, 0.0)[0]
+                new = solve_ik(chain, target[None], new[None], settings.lambda_x, 1e-3 * settings.lambda_x)[0]
         elif settings.controller == "mild-ik" and in_contact and seen:
             new = solve_ik(chain, target[None], prior[None], settings.lambda_x, settings.lambda_q)[0]
         if previous is not None:

@@ -10,6 +10,7 @@ import pytest
 from dashboard_fakes import make_inference, make_rollout
 
 from mild_viz.dashboard import charts
+from mild_viz.robot.control.rules import BY_IK, IN_CONTACT, RULES, VELOCITY
 from mild_viz.settings import STATE_COLORS
 
 
@@ -57,6 +58,24 @@ def test_true_phases_are_a_second_strip_only_where_they_are_known() -> None:
     html = charts.draw_lanes(make_rollout(inference), "human")["states"]
     assert len(segments(parse(html), "mv-phase")) == 4
     assert all(name in html for name in ("reach", "contact", "return"))
+
+
+def test_rules_are_two_strips_that_say_on_hover_what_fired() -> None:
+    fired = np.zeros(60, dtype=np.int64)
+    fired[20:40] = 1 << IN_CONTACT
+    fired[30:40] |= 1 << BY_IK
+    fired[35:38] |= 1 << VELOCITY
+    lane = parse(charts.draw_lanes(make_rollout(make_inference(n=60), fired=fired), "human")["rules"])
+    contact, safety = segments(lane, "mv-strip"), segments(lane, "mv-safety")
+    assert [color != "transparent" for _, _, color in contact] == [False, True, True, False]
+    assert contact[1][0] == pytest.approx(100 * 19.5 / 59, abs=0.01)
+    assert [color != "transparent" for _, _, color in safety] == [False, True, False]
+    assert safety[1][2] != contact[1][2], "the safety filter's rules have a colour of their own"
+    hints = [str(node.get("title")) for node in lane.iter("div") if node.get("class") == "mv-segment"]
+    both = next(hint for hint in hints if hint.startswith("contact:") and "ik:" in hint)
+    assert RULES[IN_CONTACT].text in both and RULES[BY_IK].text in both and "\n" in both
+    assert RULES[VELOCITY].text not in both
+    assert any(hint.startswith(f"velocity: {RULES[VELOCITY].text}") for hint in hints)
 
 
 def test_who_waves_is_not_in_contact() -> None:

@@ -73,7 +73,7 @@ def test_nothing_overlaps_or_overflows(paused: Page, dashboard: Dashboard, width
     overflowing = """() => [...document.querySelectorAll('.mv-name, .mv-now, .mv-range span, .mv-header, .mv-note')]
         .filter(e => e.offsetParent && (e.scrollWidth > e.clientWidth + 1) && getComputedStyle(e).display !== 'inline')
         .map(e => e.innerText)"""
-    for name in ("Trial", "Robot", "States", "View", "Record"):
+    for name in ("Trial", "Robot", "States", "Force", "View", "Record"):
         tab(page, name)
         assert page.evaluate(overflowing) == [], name
         region = page.locator("[data-dock-region='right'] [data-scrollarea-viewport]").first
@@ -165,6 +165,23 @@ def test_scrubbing_speed_and_loop(paused: Page, dashboard: Dashboard) -> None:
     eventually(lambda: not player.loop, "the loop is off")
     tick(page, "loop", True)
     eventually(lambda: player.loop and player.speed == 1.0, "all is as before")
+
+
+def test_a_click_into_the_charts_goes_there_and_can_be_dragged(paused: Page, dashboard: Dashboard) -> None:
+    last = dashboard.player.n_frames - 1
+    for lane, share in ((".mv-fired .mv-plot", 0.25), (".mv-strip", 0.6)):
+        left, top, right, _ = rectangle(paused, lane)
+        paused.mouse.click(left + share * (right - left), top + 4)
+        eventually(lambda share=share: abs(dashboard.player.frame - share * last) <= 1, f"frame at {share} of {lane}")
+    left, top, right, _ = rectangle(paused, ".mv-joints .mv-plot")
+    paused.mouse.move(left + 0.3 * (right - left), top + 4)
+    paused.mouse.down()
+    paused.mouse.move(left + 0.8 * (right - left), top + 4, steps=3)
+    paused.mouse.up()
+    eventually(lambda: abs(dashboard.player.frame - 0.8 * last) <= 1, "the drag ended at 0.8 of the trial")
+    paused.mouse.move(left + 0.1 * (right - left), top + 4)
+    paused.wait_for_timeout(300)
+    assert abs(dashboard.player.frame - 0.8 * last) <= 1, "the mouse was let go"
 
 
 def test_recordings_are_downloaded_and_open(

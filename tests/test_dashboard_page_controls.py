@@ -24,6 +24,7 @@ from dashboard_browser import (
 
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.dashboard.app import Dashboard
+from mild_viz.errors import UserError
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -62,8 +63,55 @@ def test_control_settings_rerun_only_the_control(paused: Page, dashboard: Dashbo
     after(dashboard, lambda: slide(page, "Smoothing", "0.8"), 0, 1)
     stiff = after(dashboard, lambda: tick(page, "Soft in contact", False), 0, 1)
     assert (stiff.stiffness == 1.0).all() and (first.stiffness < 1.0).any()
-    again = after(dashboard, lambda: tick(page, "Soft in contact", True), 0, 1)
+    after(dashboard, lambda: tick(page, "Soft in contact", True), 0, 1)
+    both = after(dashboard, lambda: choose(page, "Other arm", "mild"), 0, 1)
+    assert [arm.controller for arm in both.other_arms] == ["mild"]
+    left = both.link_names.index("LForeArm")
+    assert np.ptp(both.link_poses[:, left], axis=0).max() > 0.05 > np.ptp(first.link_poses[:, left], axis=0).max()
+    again = after(dashboard, lambda: choose(page, "Other arm", "rest"), 0, 1)
     assert np.array_equal(again.joints_commanded, first.joints_commanded)
+
+
+def test_the_page_simulates_when_asked(paused: Page, dashboard: Dashboard) -> None:
+    page, stage = paused, dashboard.compliance
+    n_control = dashboard.session.n_control
+    assert page.locator(".mv-force").count() == 0
+    tab(page, "Force")
+    tick(page, "Simulate", True)
+    page.get_by_text("Force, peak [N]").wait_for(timeout=20_000)
+    page.locator(".mv-force polyline").first.wait_for(state="attached")
+    assert dashboard.session.wait_idle() and stage.n_simulated == 1
+    eventually(lambda: (scene_props(page, "/compliance/text") or {}).get("text"), "the force is written")
+    below = ("Robot hand to wrist", "Hand force", "time")
+    names = {name: page.locator(f".mv-lane .mv-name:has-text('{name}')").bounding_box() for name in below}
+    tops = [box["y"] for box in names.values() if box is not None]
+    assert len(tops) == len(below) and tops == sorted(tops), "force is between distance and time"
+    choose(page, "Stiffness", "full")  # drawn from what is there
+    choose(page, "Shaking by", "human alone")
+    eventually(lambda: stage.n_simulated == 2, "the other scenario is simulated")
+    choose(page, "Shaking by", "robot as commanded")
+    page.wait_for_timeout(300)
+    assert dashboard.session.wait_idle() and stage.n_simulated == 2, "what was simulated is kept"
+    assert dashboard.session.n_control == n_control, "the rollout is not run again"
+    tick(page, "Simulate", False)
+    eventually(lambda: page.locator(".mv-force").count() == 0, "the lane goes")
+    assert not row(page, "Shaking by").count()
+
+
+def test_a_robot_without_inertia_says_so_in_its_tab(
+    paused: Page, dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise UserError("nothing that joint 'x' moves has an <inertial>")
+
+    monkeypatch.setattr("mild_viz.dashboard.compliance.compare", refuse)
+    page = paused
+    tab(page, "Force")
+    dashboard.compliance._found.clear()
+    tick(page, "Simulate", True)
+    page.get_by_text("Not simulated: nothing that joint 'x' moves has an <inertial>.").wait_for(timeout=20_000)
+    assert dashboard.session.error is None
+    tick(page, "Simulate", False)
 
 
 def test_placement_moves_the_human_and_can_be_reset(paused: Page, dashboard: Dashboard) -> None:
@@ -107,6 +155,14 @@ def test_contact_states_gate_the_controller_and_are_saved(paused: Page, dashboar
     for one in sorted(first.contact_states - {state}):
         after(dashboard, lambda one=one: tick(page, f"State {one}", True), 0, 1)
         page.get_by_text("Not saved: ").wait_for()
+    tab(page, "Trial")
+    after(dashboard, lambda: choose(page, "Variant", "v4"), 1, 1)
+    back = after(dashboard, lambda: choose(page, "Variant", "v3.1"), 1, 1)
+    assert back.contact_states == first.contact_states != {state}, "what was ticked, though it was not saved"
+    tab(page, "States")
+    if first.contact_states != {state}:
+        page.get_by_role("button", name="Save contact states").click()
+        page.get_by_text("Saved: ").wait_for()
 
 
 def test_trial_action_and_variant_rerun_everything(paused: Page, dashboard: Dashboard, model: Path) -> None:
@@ -187,7 +243,7 @@ def test_values_that_no_widget_offers_are_refused(paused: Page, dashboard: Dashb
     by_label = {label: uuid for label, (uuid, _) in widgets(dashboard).items()}
     page.evaluate(send, [by_label["Controller"], "rm -rf"])
     page.locator(".mv-error", has_text="Controller 'rm -rf' is unknown").wait_for()
-    assert page.locator(".mantine-Notification-root", has_text="could not be done").count() == 1
+    page.locator(".mantine-Notification-root", has_text="could not be done").wait_for()  # one, in a message of its own
     assert "Controller 'rm -rf' is unknown; valid: base-ik, mild, mild-ik" in str(dashboard.session.error)
     assert shown(dashboard) is good
     after(dashboard, lambda: choose(page, "Controller", "mild"), 0, 1)

@@ -8,6 +8,7 @@ from dashboard_fakes import make_inference, make_rollout
 from mild_viz.dashboard.controls import header_html, now_html
 from mild_viz.dashboard.tabs.view import swapped
 from mild_viz.dashboard.timeline import _now
+from mild_viz.robot.control.rules import IN_CONTACT, VELOCITY
 
 
 def test_state_stiffness_and_distance() -> None:
@@ -18,6 +19,14 @@ def test_state_stiffness_and_distance() -> None:
         assert "state <b>1</b> · contact state" in text and "stiffness 40 %" in text
         assert "robot hand to wrist" in text and "12.3 cm" in text
     assert "free motion" in now_html(rollout, 0) and "stiffness 100 %" in now_html(rollout, 0)
+
+
+def test_the_rules_that_fired_are_named() -> None:
+    fired = np.zeros(60, dtype=np.int64)
+    fired[30] = 1 << IN_CONTACT | 1 << VELOCITY
+    rollout = make_rollout(make_inference(), fired=fired)
+    assert "rules: contact, velocity</div>" in now_html(rollout, 30)
+    assert "rules: none</div>" in now_html(rollout, 29)
 
 
 def test_no_distance_where_tracking_was_lost() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mild_viz.data.handover import read_handover
 from mild_viz.data.skeletons import ARM_JOINTS, NUITRACK_JOINTS, ZED_JOINTS, joint_indices, person_frame, to_world
@@ -41,6 +42,38 @@ def test_handovers_put_both_bodies_back_into_one_world(dataset: Load, data_root:
         distance = np.linalg.norm(wrists[0][:, :, None] - wrists[1][:, None], axis=-1).min(axis=0)
         closest.append(np.unravel_index(distance.argmin(), (2, 2)))
     assert set(closest) == {(0, 0)}  # right hand to right hand, always
+
+
+def heading(rotations: Rotation) -> float:
+    """By how much an object has turned about the vertical from the first frame to the last [rad]."""
+    return float((rotations[-1] * rotations[0].inv()).as_rotvec()[2])
+
+
+def test_the_object_turns_with_the_hand_that_holds_it(dataset: Load, data_root: Path) -> None:
+    """While the giver holds it, it turns about the vertical as the giver's forearm does, who follows the receiver.
+
+    This tells unit, frame and the quaternion's order: read as xyzw, the object would not turn at all.
+    """
+    with np.load(data_root / "handover" / "test.npz") as file:
+        recorded, offsets = file["object_quaternion"].astype(float), file["offsets"]
+    forearm, read, swapped, apart = [], [], [], []
+    for index, trial in enumerate(dataset("handover").test):
+        track, T_world_human, T_world_partner = trial.object_track, trial.T_world_human, trial.T_world_partner
+        assert track is not None and T_world_human is not None and T_world_partner is not None
+        assert trial.partner_arm is not None
+        giver, receiver = to_world(T_world_partner, trial.partner_arm), to_world(T_world_human, trial.human_arm)
+        held = slice(0, int(np.nanargmin(np.linalg.norm(giver[:, 2] - receiver[:, 2], axis=1))) + 1)
+        own = Rotation.from_quat(track.wxyzs[held][:, [1, 2, 3, 0]])
+        rotations = Rotation.from_matrix(T_world_human[:3, :3]) * own
+        along = giver[held, 2] - giver[held, 1]
+        angle = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+        forearm.append(angle[-1] - angle[0])
+        read.append(heading(rotations))
+        swapped.append(heading(Rotation.from_quat(recorded[offsets[index] :][held])))
+        apart.append(np.linalg.norm(to_world(T_world_human, track.positions)[held] - giver[held, 2], axis=1))
+    assert np.corrcoef(forearm, read)[0, 1] > 0.7 and np.median(forearm) < -0.6 and np.median(read) < -0.6
+    assert abs(np.corrcoef(forearm, swapped)[0, 1]) < 0.2 and abs(np.median(swapped)) < 0.1
+    assert np.median(np.concatenate(apart)) == pytest.approx(0.31, abs=0.02)
 
 
 def write_handover(root: Path, **changes: Any) -> None:
@@ -126,6 +159,49 @@ def test_a_trial_that_begins_with_a_gap_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(gap.T_world_human, plain.T_world_human, atol=1e-12)
     assert np.isnan(gap.human_arm[0]).all()
     np.testing.assert_allclose(gap.human_arm[1:], plain.human_arm[1:], atol=1e-12)
+
+
+def test_an_object_is_read_in_the_humans_own_frame_whichever_way_is_up(tmp_path: Path) -> None:
+    position = np.tile([0.5, 0.1, 1.2], (40, 1))
+    quarter = Rotation.from_euler("z", np.repeat([[0.0], [np.pi / 2]], 20, axis=0))
+    position[25] = np.nan
+    for up, turn in TURNS.items():
+        turned = (Rotation.from_matrix(turn) * quarter * Rotation.from_matrix(turn).inv()).as_quat()[:, [3, 0, 1, 2]]
+        turned[25] = np.nan
+        write_handover(tmp_path)
+        with np.load(tmp_path / "handover" / "train.npz") as file:
+            bodies = {name: file[name] @ turn.T for name in ("receiver", "giver")}
+        write_handover(tmp_path, **bodies, object_position=position @ turn.T, object_quaternion=turned)
+        first, track = (read_handover(tmp_path).trial("train", i).object_track for i in range(2))
+        assert first is not None and track is not None, up
+        np.testing.assert_allclose(track.positions[4], [0.5, 0.1, -0.2], atol=1e-12)
+        before, after = (Rotation.from_quat(one.wxyzs[4, [1, 2, 3, 0]]) for one in (first, track))
+        np.testing.assert_allclose((after * before.inv()).as_rotvec(), [0.0, 0.0, np.pi / 2], atol=1e-12)
+        assert np.isnan(track.positions[5]).all() and np.isnan(track.wxyzs[5]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"object_position": np.zeros((40, 3))}, " has object_position but no object_quaternion; expected both"),
+        (
+            {"object_position": np.zeros((39, 3)), "object_quaternion": np.zeros((40, 4))},
+            r": object_position is float64 of shape \(39, 3\); expected \(40, 3\)",
+        ),
+        (
+            {"object_position": np.zeros((40, 3)), "object_quaternion": np.zeros((40, 4))},
+            ": object_quaternion of frame 0 has length 0; expected unit quaternions",
+        ),
+        (
+            {"object_position": np.full((40, 3), np.inf), "object_quaternion": np.zeros((40, 4))},
+            ": object_position has an infinite value",
+        ),
+    ],
+)
+def test_a_bad_object_names_file_and_reason(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:
+    write_handover(tmp_path, **changes)
+    with pytest.raises(UserError, match=f"handover/train.npz{complaint}"):
+        read_handover(tmp_path)
 
 
 def test_a_recording_in_which_nobody_stands_is_refused(tmp_path: Path) -> None:

@@ -56,8 +56,9 @@ def test_phases_follow_one_another_and_the_robot_is_at_rest_at_both_ends(model: 
         assert not each.command.contact and each.command.fired == 0
     moved = np.array([each.command.joints_commanded for each in decisions])
     assert np.abs(moved - rest).max() > 0.5 and any(each.command.contact for each in decisions)
+    now = handshake.n_frames / RATE
     while controller.tracker.phase == RETURNING:
-        controller.tick(controller._commanded + 1 / RATE)  # pyright: ignore[reportOperatorIssue]
+        controller.tick(now := now + 1 / RATE)
     assert controller.at_rest
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -43,6 +42,7 @@ from mild_viz.live.session import Session, plain, read_session, to_line
 from mild_viz.live.setup import live_model, make_guard
 from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer
+from mild_viz.settings import WINDOW
 from mild_viz.streaming import StreamModel
 
 HANDSHAKE, WAVE = 4, 0
@@ -148,14 +148,12 @@ def test_an_interaction_is_a_trial_for_the_pipeline(recorded: tuple[Session, lis
     taken = [tick for tick in interactions(session)[1] if tick_taken(tick)]
     said = [tick.decision.command for tick in taken if tick.decision is not None]
     assert len(said) > 80 and inference.n_windows >= len(said)
-    rows = slice(inference.n_windows - len(said), None)
+    rows = np.cumsum([len(tick.decision.samples) for tick in taken if tick.decision is not None]) - WINDOW
     np.testing.assert_allclose(inference.log_alpha_human[rows], [each.log_alpha for each in said], atol=1e-9)
     np.testing.assert_allclose(inference.joints_decoded[rows], [each.joints_decoded for each in said], atol=1e-9)
     np.testing.assert_allclose(inference.robot_latent_mean[rows], [each.robot_latent_mean for each in said], atol=1e-9)
     np.testing.assert_allclose(rollout.target[rows], [each.target for each in said], atol=1e-12)
-    # The arm began at rest, the pipeline's with the first window; and frames came as fast as the test could send them.
-    apart = np.abs(rollout.joints_commanded[rows] - [tick.sent.positions for tick in taken if tick.sent]).max(1)
-    assert apart[0] > 0.1 and np.median(apart[len(apart) // 2 :]) < 0.05
+    assert rollout.contact[rows].tolist() == [each.contact for each in said]
 
 
 def test_the_rollout_of_a_session_is_what_was_sent(recorded: tuple[Session, list[Tick]]) -> None:
@@ -288,12 +286,10 @@ def test_a_disk_that_is_too_slow_stops_the_recording(tmp_path: Path, monkeypatch
 
 
 KILLED = """
-import sys, time
+import sys
 sys.path.insert(0, {tests!r})
-import threading
 from pathlib import Path
 from test_live_session import demo_model, run
-threading.Thread(target=lambda: (time.sleep(0.01), print("running", flush=True)), daemon=True).start()
 run(demo_model(), Path({path!r}), (4, 4, 4, 4))
 """
 
@@ -301,7 +297,7 @@ run(demo_model(), Path({path!r}), (4, 4, 4, 4))
 def test_after_kill_9_the_session_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "killed.jsonl"
     script = KILLED.format(tests=str(Path(__file__).parent), path=str(path))
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+    process = subprocess.Popen([sys.executable, "-c", script])
     try:
         deadline = time.monotonic() + 60.0
         while not (path.exists() and path.stat().st_size > 300_000) and time.monotonic() < deadline:
@@ -312,6 +308,3 @@ def test_after_kill_9_the_session_can_be_read(tmp_path: Path) -> None:
     session = read_session(path)
     assert len(session.ticks) > 80 and interactions(session)
     assert len(session.ticks) == recorded_lines(path) - 1
-
-
-assert resource  # what `full_disk` needs: these tests are for systems that have it

@@ -16,12 +16,12 @@ from mild_viz.errors import UserError
 from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer
 from mild_viz.robot.control import rules
-from mild_viz.robot.control.other_arm import mirrored
+from mild_viz.robot.control.other_arm import mirrored, other_arm_options
 from mild_viz.robot.control.safety import limits_of
 from mild_viz.robot.ik import forward, solve_ik
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.rollout import OTHER_SAVED, Rollout
-from mild_viz.settings import ControlSettings
+from mild_viz.settings import OTHER_ARM, ControlSettings
 from mild_viz.trial import Trial
 
 
@@ -127,6 +127,20 @@ def test_it_is_in_the_rollouts_file(model: Checkpoint, robot: RobotModel, handsh
         for name in OTHER_SAVED:
             np.testing.assert_array_equal(arrays[f"left_{name}"], getattr(rollout.other_arms[0], name))
         np.testing.assert_array_equal(arrays["fired"], rollout.fired)
+
+
+def test_only_what_can_be_is_offered(model: Checkpoint, robot: RobotModel, handshake: Trial) -> None:
+    body = handshake.human_skeleton
+    assert other_arm_options(robot, body) == OTHER_ARM
+    assert other_arm_options(robot, None) == ("rest", "mild")
+    assert other_arm_options(replace(robot, arms={"right": robot.chain}), body) == ()
+    unlike = replace(robot, spec=replace(robot.spec, arms={
+        name: replace(arm, mirror_of=None, mirror_signs=()) for name, arm in robot.spec.arms.items()
+    }))  # fmt: skip
+    assert other_arm_options(unlike, body) == ("rest", "base-ik")
+    for offered in OTHER_ARM:  # and what is offered is not refused
+        run(model, robot, handshake, offered)
+    run(model, unlike, handshake, "base-ik")
 
 
 def test_what_cannot_be_is_refused(model: Checkpoint, robot: RobotModel, handshake: Trial) -> None:

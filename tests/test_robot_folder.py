@@ -56,6 +56,8 @@ handshake = { slide = 0.04 }
 [safety]
 margin = 0.05
 acceleration = 8.0
+[dynamics]
+rotor_inertia = 0.03
 """
 
 
@@ -74,6 +76,7 @@ def test_a_folder_is_a_robot(crane: Path) -> None:
     np.testing.assert_array_equal(robot.chain.rest, [0.0, 0.0, 0.0, 1.0, 0.0])
     np.testing.assert_array_equal(robot.chain.velocity, np.full(5, 3.0))
     assert (robot.spec.safety.margin, robot.spec.safety.acceleration) == (0.05, 8.0)
+    assert robot.spec.dynamics.rotor_inertia == 0.03
     # stretched out, the tip is beyond the last joint by its offset
     hand = robot.end_effector(np.zeros((1, 5)))[0]
     np.testing.assert_allclose(hand, [0.15 + 0.2 + 0.15 + 0.2, 0.0, 0.5 + 0.05], atol=1e-9)
@@ -128,6 +131,7 @@ def test_the_whole_pipeline_drives_it_without_code(crane: Path) -> None:
         (("slide = 0.04", "slid = 0.04"), "hands.handshake: there is no joint 'slid'"),
         (("handshake =", "handshaking ="), "action 'handshaking' is unknown"),
         (("bend = 1.0", 'bend = "up"'), "rest.bend is 'up', expected a finite number"),
+        (("inertia = 0.03", "inertia = -0.03"), "valid: a finite number of 0 or more kg m^2"),
         (("margin = 0.05", "margin = -0.05"), "valid: a margin of 0 to 0.5 rad"),
         (("[safety]", "[stiffness]\nlowest = 0.9\nhighest = 0.4\n[safety]"), "0 <= lowest <= highest <= 1"),
         (('elbow = "bend"', 'retarget = "angles"'), "retarget 'angles' is unknown; valid: position, pepper-angles"),

@@ -23,7 +23,8 @@ def write(robot: str, out: Path) -> None:
     for name, pieces in drawn.items():
         (out / "meshes" / f"{name}.ply").write_bytes(ply(pieces))
     meshes = {name: name for name in drawn} | model.SHARED
-    (out / f"{robot}.urdf").write_text(urdf(robot, model.ROOT, model.JOINTS, meshes), encoding="utf-8", newline="\n")
+    text = urdf(robot, model.ROOT, model.JOINTS, meshes, getattr(model, "INERTIALS", None))
+    (out / f"{robot}.urdf").write_text(text, encoding="utf-8", newline="\n")
 
 
 def main() -> None:

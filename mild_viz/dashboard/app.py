@@ -14,7 +14,9 @@ from mild_viz import paths, pipeline
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.dashboard.address import is_loopback, page_url
 from mild_viz.dashboard.catalog import Catalog
+from mild_viz.dashboard.compliance import ComplianceStage
 from mild_viz.dashboard.controls import Controls
+from mild_viz.dashboard.live.recorded import RecordedSession, open_recorded
 from mild_viz.dashboard.player import Player
 from mild_viz.dashboard.scene.scene import Scene
 from mild_viz.dashboard.server import check_port, open_server
@@ -27,7 +29,7 @@ from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
-from mild_viz.settings import CONTROLLERS_OF, InferSettings, choose
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings, InferSettings, choose
 from mild_viz.trial import Dataset
 
 LABEL = "mild_viz"
@@ -37,8 +39,9 @@ class Dashboard:
     """A running page. `stop` ends it."""
 
     def __init__(
-        self, host: str, port: int, catalog: Catalog, robot: RobotModel, model: str, first: InferSettings
-    ) -> None:
+        self, host: str, port: int, catalog: Catalog, robot: RobotModel, model: str, first: InferSettings,
+        recorded: RecordedSession | None = None,
+    ) -> None:  # fmt: skip
         self.server = open_server(host, port, LABEL)
         self.url = page_url(host, port)
         self._dark: bool | None = None
@@ -47,11 +50,13 @@ class Dashboard:
         self.player = Player(self.scene.set_frame, self._tick, lambda: bool(self.server.get_clients()))
         self.controls = Controls(
             self.server, catalog, first, model, lambda: self.session.mark_dirty(), self.scene.move_camera,
-            self._write_html, self._write_csv,
+            self._write_html, self._write_csv, ControlSettings() if recorded is None else recorded.settings,
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
-        stages = Pipeline(pipeline.infer, pipeline.control)
-        self.session = Session(self.controls.read, stages, self._show, self.controls.report)
+        of = pipeline if recorded is None else recorded
+        stages = Pipeline(of.infer, of.control)
+        self.compliance = ComplianceStage(self.scene, self.controls.compliance, self.timeline)
+        self.session = Session(self.controls.read, stages, self._show, self.controls.report, self.compliance.run)
         self._playing = asyncio.run_coroutine_threadsafe(self.player.run(), self.server.get_event_loop())
         self._fitting = asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
         self.session.start()
@@ -155,8 +160,9 @@ def open_dashboard(
     robot_source: RobotSource = "own",
     host: str = "127.0.0.1",
     port: int = 8080,
+    session: Path | None = None,
 ) -> Dashboard:
-    """Load model, data and robot (default: the model's own), and start the page.
+    """Load model, data and robot (default: the model's own), or a recorded session, and start the page.
 
     Returns while the first rollout is computed.
 
@@ -164,18 +170,23 @@ def open_dashboard(
         UserError: for anything that was given and cannot be used.
     """
     check_port(host, port)
-    recordings = load_dataset(dataset)
-    folder = checkpoint or paths.default_checkpoint(dataset)
-    model = load_checkpoint(folder)
-    arm = open_robot(model, robot, robot_source)
-    catalog = Catalog(arm, folder, robot_source)
+    recorded = None if session is None else open_recorded(session, checkpoint)
+    if recorded is not None:
+        recordings, model, arm = recorded.dataset, recorded.checkpoint, recorded.robot
+        folder, dataset, variant = model.path, recordings.name, variant or recorded.variant
+    else:
+        recordings = load_dataset(dataset)
+        folder = checkpoint or paths.default_checkpoint(dataset)
+        model = load_checkpoint(folder)
+        arm = open_robot(model, robot, robot_source)
+    catalog = Catalog(arm, folder, robot_source, None if recorded is None else recordings)
     shown = catalog.robot_name
     first = first_settings(recordings, model, action, trial, variant)
     name = catalog.name_of(folder)
     problem = catalog.problem(name, dataset, shown)
     if problem is not None:
         raise UserError(problem)
-    return Dashboard(host, port, catalog, arm, name, first)
+    return Dashboard(host, port, catalog, arm, name, first, recorded)
 
 
 def run(
@@ -189,9 +200,10 @@ def run(
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
+    session: Path | None = None,
 ) -> None:
     """Start the page and serve it until Ctrl-C."""
-    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port)
+    dashboard = open_dashboard(checkpoint, dataset, action, trial, variant, robot, robot_source, host, port, session)
     console = Console()
     console.print(f"[bold]mild_viz[/bold] is at [link={dashboard.url}]{dashboard.url}[/link]  (stop it with Ctrl-C)")
     if not is_loopback(host):

@@ -20,7 +20,10 @@ from mild_viz.trial import Dataset, Trial
 class Catalog:
     """Datasets, models and robots by name. Each is read when it is first asked for, and then kept."""
 
-    def __init__(self, robot: RobotModel, chosen: Path | None = None, source: RobotSource = "own") -> None:
+    def __init__(
+        self, robot: RobotModel, chosen: Path | None = None, source: RobotSource = "own",
+        recorded: Dataset | None = None,
+    ) -> None:  # fmt: skip
         known = ROBOTS.get(robot.name)
         # another description of a robot that is known by name has its file for a name
         self.robot_name = robot.name if known is None or known.urdf == robot.spec.urdf else str(robot.spec.urdf)
@@ -30,6 +33,8 @@ class Catalog:
         self._problems: dict[tuple[str, str, str], str | None] = {}
         self.chosen = None if chosen is None else chosen.resolve()
         self._source: RobotSource = source
+        self._recorded = recorded
+        """A live session, beside the datasets."""
 
     @cached_property
     def model_paths(self) -> dict[str, Path]:
@@ -72,7 +77,7 @@ class Catalog:
         return self._robots[name]
 
     def dataset(self, name: str) -> Dataset:
-        return load_dataset(name)
+        return self._recorded if self._recorded is not None and name == self._recorded.name else load_dataset(name)
 
     def checkpoint(self, model: str) -> Checkpoint:
         """The model of that name on the page."""
@@ -111,7 +116,7 @@ class Catalog:
                 f"dataset '{dataset}' holds {', '.join(recordings.actions)}"
             )
         if checkpoint.robot is None:
-            people = any(trial.partner_arm is not None for trial in trials)
+            people = dataset not in DATASETS or any(trial.partner_arm is not None for trial in trials)
             return None if people else f"model '{model}' predicts a second human; dataset '{dataset}' shows none"
         recorded = next((trial for trial in trials if trial.robot_joints is not None), None)
         if recorded is not None and recorded.robot_joint_names != checkpoint.robot.joint_names:
@@ -148,7 +153,8 @@ class Catalog:
 
     def robot_for(self, dataset: str, robot: str) -> str | None:
         """`robot` if a model drives it on this dataset, else the one that the dataset's models are made for, if any."""
-        names = dict.fromkeys([robot, robot_of(dataset), *self.robot_titles])
+        own = [robot_of(dataset)] if dataset in DATASETS else []
+        names = dict.fromkeys([robot, *own, *self.robot_titles])
         return next((name for name in names if name in self.robot_titles and self.models(dataset, name)), None)
 
     def dataset_for(self, robot: str, dataset: str) -> str | None:

@@ -13,15 +13,29 @@ from html import escape
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mild_viz.robot.control.rules import RULES, fired_rules
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import STATE_COLORS
+from mild_viz.simulation.compare import Comparison
 from mild_viz.trial import CONTACT_ACTIONS, PHASES
 
 WIDTH, HEIGHT = 1000, 1000
 """Of a picture, in its own units: it is stretched to the lane."""
-LANES = ("states", "alpha", "joints", "distance", "axis")
+LANES = ("states", "rules", "alpha", "joints", "distance", "axis")
 MAX_POINTS = 600
-SEEK = " (drag the frame bar to go there)"
+SEEK = " (click to go there)"
+SEEK_EVENT = escape(
+    "if (event.button === 0 && event.target.closest('.mv-plot, .mv-rows')) { "
+    "document.querySelector('div:has(> div > .mv-timeline) .mantine-Slider-track')?.dispatchEvent("
+    "new MouseEvent('mousedown', {clientX: event.clientX, clientY: event.clientY, bubbles: true})); "
+    "event.preventDefault(); }"
+)
+"""What a lane does when it is pressed: the same as the frame bar at that place, so that it can be dragged too."""
+RULE_COLORS = tuple(
+    f"color-mix(in srgb, var(--mantine-color-{color}) {share}%, transparent)"
+    for color, share in (("text", 14), ("orange-6", 55))
+)
+"""Rules of contact, and those of the safety filter."""
 PHASE_COLORS = tuple(
     f"color-mix(in srgb, var(--mantine-color-text) {share}%, var(--mantine-color-body))" for share in (0, 30, 75, 15)
 )
@@ -43,6 +57,7 @@ def draw_lanes(rollout: Rollout, alpha_mode: str) -> dict[str, str]:
     """One snippet of HTML for each of `LANES`."""
     return {
         "states": _states(rollout),
+        "rules": _rules(rollout),
         "alpha": _alpha(rollout.inference, alpha_mode),
         "joints": _joints(rollout),
         "distance": _distance(rollout),
@@ -99,7 +114,7 @@ def _lane(name: str, note: str, plot: str, span: tuple[str, str] = ("", ""), css
     note = f"<small>{note}</small>" if note else ""
     top, bottom = span
     return (
-        f'<div class="mv-lane {css}"><div class="mv-name">{name}{note}</div>'
+        f'<div class="mv-lane {css}" onmousedown="{SEEK_EVENT}"><div class="mv-name">{name}{note}</div>'
         f'<div class="mv-plot">{plot}<div class="mv-cursor"></div></div>'
         f'<div class="mv-range"><span>{top}</span><span>{bottom}</span></div></div>'
     )
@@ -119,8 +134,14 @@ def _bands(mask: Bool[np.ndarray, " N"], css: str) -> str:
     return "".join(bands)
 
 
-def _strip(values: Int[np.ndarray, " N"], css: str, colors: dict[int, str], names: dict[int, str]) -> str:
-    """Coloured segments, each with its name where it fits."""
+def _strip(
+    values: Int[np.ndarray, " N"],
+    css: str,
+    colors: dict[int, str],
+    names: dict[int, str],
+    hints: dict[int, str] | None = None,
+) -> str:
+    """Coloured segments, each with its name where it fits, and its hint (or its name) under the mouse."""
     segments = []
     for start, end, value in runs(values):
         left, width = _span(start, end, len(values))
@@ -129,8 +150,9 @@ def _strip(values: Int[np.ndarray, " N"], css: str, colors: dict[int, str], name
         if color == PHASE_COLORS[PHASES.index("contact")]:
             ink = "var(--mantine-color-body)"
         shown = name if width > 0.75 * len(name) + 0.8 else ""
+        hint = f"{(hints or names)[value]}{SEEK}".strip()
         segments.append(
-            f'<div class="mv-segment" title="{name}{SEEK}" style="left:{left:.2f}%;width:{width:.2f}%;'
+            f'<div class="mv-segment" title="{hint}" style="left:{left:.2f}%;width:{width:.2f}%;'
             f'background:{color};color:{ink}">{shown}</div>'
         )
     return f'<div class="{css}">{"".join(segments)}</div>'
@@ -151,6 +173,22 @@ def _states(rollout: Rollout) -> str:
         note = "true phase"
     css = "mv-states mv-with-phase" if inference.phase is not None else "mv-states"
     return _lane("Active state", note, plot, css=css)
+
+
+def _rules(rollout: Rollout) -> str:
+    """Which rules fired when: those of contact above, those of the safety filter below; what they mean as hints."""
+    strips = []
+    for safety, css in ((False, "mv-strip"), (True, "mv-safety")):
+        bits = sum(1 << number for number, rule in enumerate(RULES) if rule.safety == safety)
+        values = rollout.fired & bits
+        fired = {int(mask): fired_rules(int(mask)) for mask in np.unique(values)}
+        colors = {mask: RULE_COLORS[safety] if mask else "transparent" for mask in fired}
+        names = {mask: " · ".join(rule.name for rule in rules) for mask, rules in fired.items()}
+        hints = {
+            mask: "&#10;".join(f"{rule.name}: {escape(rule.text)}" for rule in rules) for mask, rules in fired.items()
+        }
+        strips.append(_strip(values, css, colors, names, hints))
+    return _lane("Rules", "safety", "".join(strips), css="mv-fired")
 
 
 @lru_cache(maxsize=8)  # a control-only rerun keeps the inference
@@ -190,7 +228,8 @@ def _joints(rollout: Rollout) -> str:
         key += '<span class="mv-key"><i class="mv-patch mv-gap"></i>tracking lost</span>'
     head = f'<div class="mv-head"><div class="mv-name">Joint angles</div>{key}</div>'
     cursor = '<div class="mv-over"><div class="mv-cursor"></div></div>'
-    return f'<div class="mv-lane mv-joints">{head}<div class="mv-rows">{"".join(rows)}</div>{cursor}</div>'
+    lane = f'<div class="mv-lane mv-joints" onmousedown="{SEEK_EVENT}">'
+    return f'{lane}{head}<div class="mv-rows">{"".join(rows)}</div>{cursor}</div>'
 
 
 def _distance(rollout: Rollout) -> str:
@@ -212,6 +251,19 @@ def _distance(rollout: Rollout) -> str:
         + (_line(stiffness, 0.0, 1.06, "mv-stiffness") if varies else "")
     )
     return _lane("Robot hand to wrist", "dotted: stiffness" if varies else "", plot, (f"{high:.0f} cm", "0"))
+
+
+def force_lane(rollout: Rollout, comparison: Comparison) -> str:
+    """The largest force between the hands since the frame before, with full stiffness and with the schedule."""
+    fixed, schedule = (comparison.motions[name] for name in ("fixed", "schedule"))
+    high = max(float(fixed.force_peak.max()), float(schedule.force_peak.max()), 1.0)
+    plot = _svg(
+        _grid(rollout.inference)
+        + _bands(schedule.gripped, "mv-touch")
+        + _line(fixed.force_peak, 0.0, 1.06 * high, "mv-full")
+        + _line(schedule.force_peak, 0.0, 1.06 * high, "mv-commanded")
+    )
+    return _lane("Hand force", "dashed: full stiffness", plot, (f"{high:.0f} N", "0"), "mv-force")
 
 
 def tick_times(start: float, end: float) -> list[float]:

@@ -11,10 +11,11 @@ import viser
 
 from mild_viz.checkpoint import save_contact_states
 from mild_viz.dashboard.catalog import Catalog
-from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
+from mild_viz.dashboard.readout import distance_html, rules_text, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
 from mild_viz.dashboard.style import PANEL_CSS, PANEL_WIDTH
 from mild_viz.dashboard.tabs.compare import CompareFolder
+from mild_viz.dashboard.tabs.compliance import ComplianceTab
 from mild_viz.dashboard.tabs.record import RecordTab, Writer
 from mild_viz.dashboard.tabs.robot import RobotTab
 from mild_viz.dashboard.tabs.states import StatesTab
@@ -24,7 +25,7 @@ from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import ControllerFigures
 from mild_viz.rollout import Rollout
-from mild_viz.settings import InferSettings, Settings
+from mild_viz.settings import ControlSettings, InferSettings, Settings
 from mild_viz.trial import CONTACT_ACTIONS
 
 
@@ -41,6 +42,7 @@ class Controls:
         move_camera: Callable[[viser.ClientHandle, str], None],
         write_html: Writer,
         write_csv: Writer,
+        control: ControlSettings,
     ) -> None:
         self._server, self._catalog = server, catalog
         self._rollout: Rollout | None = None
@@ -56,11 +58,13 @@ class Controls:
         with tabs.add_tab("Trial"):
             self._trial = TrialTab(gui, catalog, first, model, changed)
         with tabs.add_tab("Robot"):
-            self._robot = RobotTab(gui, changed)
+            self._robot = RobotTab(gui, changed, control)
             self._compare = CompareFolder(gui, changed)
         with tabs.add_tab("States"):
             self._states = StatesTab(gui, changed)
             self._states.save.on_click(lambda _event: self._save_contact_states())
+        with tabs.add_tab("Force"):
+            self.compliance = ComplianceTab(gui, changed)
         with tabs.add_tab("View"):
             self._view = ViewTab(gui, changed, move_camera)
         with tabs.add_tab("Record"):
@@ -70,8 +74,8 @@ class Controls:
         """What the widgets say, checked. Raises UserError naming the widget."""
         infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
-        control = self._robot.read(checkpoint, trial, contact_states)
-        view = replace(self._view.read(), compared=self._compare.read())
+        control = self._robot.read(checkpoint, trial, robot, contact_states)
+        view = replace(self._view.read(), compared=self._compare.read(), compliance=self.compliance.read())
         return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 
     def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:
@@ -151,5 +155,5 @@ def now_html(rollout: Rollout, frame: int) -> str:
     emphasis = "<b>{}</b>" if rollout.inference.action in CONTACT_ACTIONS else "{}"
     return (
         f'<div class="mv-header mv-live">{state_html(rollout, frame)} · {stiffness_text(rollout, frame)}<br>'
-        f"{distance_html(rollout, frame, emphasis)}</div>"
+        f"{distance_html(rollout, frame, emphasis)}<br>rules: {rules_text(rollout, frame)}</div>"
     )

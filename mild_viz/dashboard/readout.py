@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mild_viz.dashboard.charts import state_color
+from mild_viz.robot.control.rules import fired_rules
 from mild_viz.rollout import Rollout
 
 LOST = "tracking lost"
@@ -18,6 +19,11 @@ def state_html(rollout: Rollout, frame: int) -> str:
 def stiffness_text(rollout: Rollout, frame: int) -> str:
     """Stiffness of the softest joint."""
     return f"stiffness {100 * rollout.stiffness[frame].min():.0f} %"
+
+
+def rules_text(rollout: Rollout, frame: int) -> str:
+    """The names of the rules that fired."""
+    return ", ".join(rule.name for rule in fired_rules(int(rollout.fired[frame]))) or "none"
 
 
 def distance_html(rollout: Rollout, frame: int, emphasis: str = "{}") -> str:

@@ -54,7 +54,9 @@ class Session:
     """Keeps the rollout that is shown equal to what the widgets say.
 
     `show(rollout, choice, is_new_trial)` is called from the worker after every successful rerun or change of view;
-    `report(message)` after a failure, and with None after the first success since.
+    `report(message)` after a failure, and with None after the first success since. `finish(rollout, choice, is_stale)`
+    is for what takes longer and comes after the rollout is shown; where `is_stale()` says that a newer choice waits, it
+    returns False, and is asked again.
     """
 
     def __init__(
@@ -63,8 +65,10 @@ class Session:
         pipeline: Pipeline,
         show: Callable[[Rollout, Choice, bool], None],
         report: Callable[[str | None], None],
+        finish: Callable[[Rollout, Choice, Callable[[], bool]], bool] = lambda rollout, choice, is_stale: True,
     ) -> None:
         self._read, self._pipeline, self._show, self._report = read, pipeline, show, report
+        self._finish, self._finished = finish, True
         self._dirty = threading.Event()
         self._idle = threading.Event()
         self._closed = False
@@ -147,11 +151,19 @@ class Session:
                 inference, choice.checkpoint, choice.robot, choice.trial, choice.settings.control
             )
         elif choice.view == shown.view:
+            self._complete(rollout, choice)
             return
         self._show(rollout, choice, is_new)
         # Only now, when it is on the page: after a failure above, the same choice is tried again.
         self.rollout, self.choice = rollout, choice
         self.n_shown += 1
+        self._finished = False
+        self._complete(rollout, choice)
+
+    def _complete(self, rollout: Rollout, choice: Choice) -> None:
+        """The last stage, unless it is done or a newer choice waits."""
+        if not self._finished and not self._dirty.is_set():
+            self._finished = self._finish(rollout, choice, self._dirty.is_set)
 
     def _infer(self, choice: Choice) -> tuple[Inference, Choice]:
         """Infer for the latest choice: what was chosen in the meantime decides the control that follows."""

@@ -18,7 +18,7 @@ GUTTER = (124, 64)
 TIMELINE_CSS = """
 @supports (anchor-name: --a) {
   [data-dock-region="right"] { anchor-name: --mv-right; }
-  [data-dock-root]:has(.mv-timeline) { --mv-height: clamp(290px, 38vh, 410px); }
+  [data-dock-root]:has(.mv-timeline) { --mv-height: clamp(314px, 40vh, 434px); }
   [data-dock-root]:has(.mv-timeline) > :first-child { bottom: var(--mv-height) !important; }
   [data-floating-window]:has(.mv-timeline) {
     left: 0 !important; top: auto !important; bottom: 0 !important; width: auto !important;
@@ -35,7 +35,7 @@ TIMELINE_CSS = """
 .mv-timeline { display: none; }
 div:has(> div > .mv-timeline) {
   display: grid; grid-template-columns: auto auto auto minmax(0, 1fr); align-items: center; height: 100%;
-  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
+  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
   padding: 2px 0 0 0 !important; box-sizing: border-box;
 }
 div:has(> div > .mv-timeline) > div { padding-bottom: 0 !important; }
@@ -61,6 +61,12 @@ div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-InputWrapper-root {
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-Slider-root { margin-inline: -3.7px; }
 div:has(> div > .mv-timeline) > div:nth-child(4) input { display: block; }
 .mv-lane { height: 100%; }
+[data-dock-root]:has(.mv-force) { --mv-height: clamp(330px, 43vh, 450px) !important; }
+div:has(> div > .mv-timeline):has(.mv-force) {
+  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) minmax(28px, 5fr) 14px;
+}
+div:has(> div > .mv-timeline) > div:has(> .mv-force) { order: 1; }
+div:has(> div > .mv-timeline) > div:has(> .mv-axis) { order: 2; }
 """
 TIMELINE_CSS = TIMELINE_CSS.replace("LEFT", str(GUTTER[0]))
 
@@ -88,6 +94,7 @@ CHART_CSS = """
 .mv-plot .mv-touch { fill: var(--mantine-color-text); opacity: 0.08; }
 .mv-commanded { stroke: var(--mantine-color-text); }
 .mv-stiffness { stroke: var(--mantine-color-dimmed); stroke-dasharray: 2 3; }
+.mv-full { stroke: #e8590c; stroke-dasharray: 5 3; }
 .mv-decoded { stroke: #1c7ed6; stroke-dasharray: 5 3; }
 .mv-truth { stroke: #f08c00; stroke-width: 3 !important; opacity: 0.55; }
 .mv-cursor {
@@ -98,6 +105,15 @@ CHART_CSS = """
   font-size: 10px; font-weight: 600; overflow: hidden; }
 .mv-states { height: 17px; }
 .mv-states.mv-with-phase { height: 29px; }
+.mv-fired { height: 26px; }
+.mv-fired .mv-name { align-self: flex-start; padding-top: 1px; }
+.mv-fired .mv-name small { margin-top: 2px; line-height: 11px; }
+.mv-fired .mv-plot { border-bottom: none; }
+.mv-fired .mv-strip { height: 12px; }
+.mv-safety { position: absolute; left: 0; right: 0; top: 13px; height: 12px; }
+.mv-fired .mv-segment { font-weight: 400; font-size: 9px; white-space: nowrap; box-sizing: border-box;
+  border-right: 1px solid var(--mantine-color-body); }
+.mv-lane .mv-plot, .mv-rows { cursor: pointer; }
 .mv-states .mv-name small { margin-top: 4px; line-height: 11px; }
 .mv-states .mv-name { align-self: flex-start; padding-top: 1px; }
 .mv-states .mv-plot { border-bottom: none; }
@@ -143,6 +159,7 @@ PANEL_CSS = """
 .mv-table th { font-weight: 500; text-align: right; vertical-align: bottom; padding: 2px 0 2px 6px; }
 .mv-table tr > th:first-child { text-align: left; white-space: nowrap; padding-left: 0; }
 .mv-table td { text-align: right; padding: 2px 0 2px 6px; border-top: 1px solid var(--mantine-color-default-border); }
+.mv-table td:first-child { text-align: left; padding-left: 0; }
 .mv-table tr + tr th { border-top: 1px solid var(--mantine-color-default-border); }
 .mv-note b { color: var(--mantine-color-text); }
 .mv-note code { font-size: 11px; }

@@ -11,6 +11,7 @@ from mild_viz.dashboard.player import SPEEDS, Player
 from mild_viz.dashboard.readout import distance_html, state_html, stiffness_text
 from mild_viz.dashboard.style import CHART_CSS, FLOATING_SIZE, TIMELINE_CSS
 from mild_viz.rollout import Rollout
+from mild_viz.simulation.compare import Comparison
 
 FIRST, BACK, PLAY, PAUSE, STEP, LAST = "First", "Back", "Play", "Pause", "Step", "Last"
 
@@ -40,6 +41,7 @@ class Timeline:
             )
             self._cursor = gui.add_html(charts.cursor_html(0.0))
             self._lanes = {name: gui.add_html('<div class="mv-lane"></div>') for name in charts.LANES}
+            self._force = gui.add_html("")
         panel.float(x=10, y=-10, width=FLOATING_SIZE[0], height=FLOATING_SIZE[1])
         self._connect()
         self._add_hotkeys(gui)
@@ -104,6 +106,11 @@ class Timeline:
         for name, html in charts.draw_lanes(rollout, alpha_mode).items():
             if self._lanes[name].content != html:
                 self._lanes[name].content = html
+
+    def show_force(self, comparison: Comparison | None) -> None:
+        """Draw the force between the hands, or take its lane away; `show` comes first."""
+        if self._rollout is not None:
+            self._set(self._force, "" if comparison is None else charts.force_lane(self._rollout, comparison))
 
     def tick(self, frame: int, playing: bool) -> None:
         """Follow the player: scrub bar, cursor, text (ten times a second at most)."""

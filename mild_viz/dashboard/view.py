@@ -6,6 +6,21 @@ from dataclasses import dataclass
 
 from mild_viz.errors import UserError
 from mild_viz.settings import ALPHA_MODES, CONTROLLERS, choose
+from mild_viz.simulation.compare import SCENARIOS, STIFFNESSES
+
+
+@dataclass(frozen=True)
+class ComplianceSettings:
+    """What is shown of the simulation of how the arm gives way (`mild_viz.simulation`)."""
+
+    scenario: str = "commanded"
+    """One of `SCENARIOS`."""
+    stiffness: str = "schedule"
+    """Which arm is drawn, one of `STIFFNESSES`."""
+
+    def __post_init__(self) -> None:
+        choose("scenario", self.scenario, SCENARIOS)
+        choose("stiffness", self.stiffness, STIFFNESSES)
 
 
 @dataclass(frozen=True)
@@ -25,7 +40,11 @@ class ViewSettings:
     """Draw where the robot's hand can be."""
     compared: tuple[str, ...] = ()
     """Controllers that are run too, and drawn as ghosts beside the commanded arm."""
+    compliance: ComplianceSettings | None = None
+    """None: nothing is simulated."""
     show_human: bool = True
+    show_giver: bool = True
+    """Draw the recorded giver of a handover, faint, in the robot's place."""
     show_robot: bool = True
     show_latent: bool = True
     dark: bool = False

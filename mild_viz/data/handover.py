@@ -4,6 +4,11 @@ The receiver is the human, the giver the partner. Arms are right shoulder, elbow
 of wrists it is the two right ones that come closest, in each of the 200 trials. The receiver walks up to the
 giver during a trial, so that the receiver's own frame, which the first tracked frame sets, stays behind;
 `T_world_human` and `T_world_partner` say where the frames are.
+
+The object is a rigid body with markers, one tracked point and a quaternion (w, x, y, z) in the same world as the
+bodies: read so, it turns with the hands that hold it (`tests/test_data_handover.py`). Its own axes are the world's at
+the start of each trial, and the hands are below its point: the giver's some 26 cm, the receiver's some 10 cm. Which
+object it is, and its shape, was not recorded.
 """
 
 from __future__ import annotations
@@ -19,10 +24,12 @@ from mild_viz.data.npz import load_npz
 from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
-from mild_viz.trial import HAND_POINTS, Dataset, Skeleton, Trial
+from mild_viz.trial import HAND_POINTS, Dataset, ObjectTrack, Skeleton, Trial
 
 FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
 ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
+OBJECT_ARRAYS = ("object_position", "object_quaternion")
+"""Read where they are there: (N, 3) [m] and (N, 4), wxyz."""
 REFERENCE_JOINTS = ("left_shoulder", "right_shoulder", "pelvis", "neck")
 """What sets a person's own frame: ZED's neck stands where Nuitrack has the collar, between the shoulders."""
 
@@ -62,6 +69,7 @@ def read_file(path: Path, split: str) -> list[Trial]:
     offsets, rate = _check_layout(path, arrays["offsets"], arrays["rate_hz"], len(receiver), len(giver))
     turn = _turn_upright(path, np.concatenate([receiver, giver]))
     receiver, giver = receiver @ turn.T, giver @ turn.T
+    carried = _check_object(path, arrays, len(receiver), turn)
     trials = []
     for index, (first, last) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
         try:
@@ -83,6 +91,7 @@ def read_file(path: Path, split: str) -> list[Trial]:
                 partner_skeleton=partner,
                 T_world_human=T_world_human,
                 T_world_partner=T_world_partner,
+                object_track=None if carried is None else _own_track(T_world_human, *(x[first:last] for x in carried)),
             )
         )
     return trials
@@ -112,6 +121,50 @@ def _check_layout(path: Path, offsets: np.ndarray, rate: np.ndarray, *lengths: i
     if rate.ndim != 0 or rate.dtype.kind not in "fiu" or not 0.0 < float(rate) < np.inf:
         raise UserError(f"{path}: rate_hz is {rate}; expected one number above 0")
     return limits, float(rate)
+
+
+def _check_object(
+    path: Path, arrays: dict[str, np.ndarray], n_frames: int, turn: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 3"]] | None:
+    """The object's point [m] and rotation in the upright world; None where the file has no object."""
+    present = [name for name in OBJECT_ARRAYS if name in arrays]
+    if not present:
+        return None
+    for name, width in zip(OBJECT_ARRAYS, (3, 4), strict=True):
+        array = arrays.get(name)
+        if array is None:
+            raise UserError(f"{path} has {present[0]} but no {name}; expected both, or none")
+        if array.shape != (n_frames, width) or array.dtype.kind != "f":
+            raise UserError(f"{path}: {name} is {array.dtype} of shape {array.shape}; expected ({n_frames}, {width})")
+        if np.isinf(array).any():
+            raise UserError(f"{path}: {name} has an infinite value; expected finite or NaN (a gap)")
+    position, wxyz = (arrays[name].astype(np.float64) for name in OBJECT_ARRAYS)
+    length = np.linalg.norm(wxyz, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1.0) > 1e-3)  # a gap is NaN, and not wrong
+    if len(wrong):
+        raise UserError(
+            f"{path}: object_quaternion of frame {wrong[0]} has length {length[wrong[0]]:.3g}; "
+            "expected unit quaternions"
+        )
+    from scipy.spatial.transform import Rotation  # slow to import, and only this source needs it
+
+    rotation = np.full((n_frames, 3, 3), np.nan)
+    known = np.isfinite(wxyz).all(axis=1)
+    rotation[known] = Rotation.from_quat(wxyz[known][:, [1, 2, 3, 0]]).as_matrix()
+    # Its own axes are the recording's at the start: they turn with the world, so that its up stays its up.
+    return position @ turn.T, turn @ rotation @ turn.T
+
+
+def _own_track(
+    T_world_human: Float[np.ndarray, "4 4"], positions: Float[np.ndarray, "T 3"], rotations: Float[np.ndarray, "T 3 3"]
+) -> ObjectTrack:
+    """The object in the human's own frame."""
+    from scipy.spatial.transform import Rotation
+
+    wxyzs = np.full((len(positions), 4), np.nan)
+    known = np.isfinite(rotations).all(axis=(1, 2))
+    wxyzs[known] = Rotation.from_matrix(T_world_human[:3, :3].T @ rotations[known]).as_quat()[:, [3, 0, 1, 2]]
+    return ObjectTrack(to_frame(T_world_human, positions), wxyzs)
 
 
 def _turn_upright(path: Path, bodies: Float[np.ndarray, "N 34 3"]) -> Float[np.ndarray, "3 3"]:

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import CONFIG, Checkpoint, load_checkpoint
-from mild_viz.data.skeletons import ARM_JOINTS, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, joint_indices, to_frame
 from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
-from mild_viz.latent.hmm import unobserved_forward
+from mild_viz.latent.hmm import observed_rows, unobserved_forward
 from mild_viz.live.config import LiveConfig
 from mild_viz.live.controller import Decision, LiveController
 from mild_viz.live.loop import Tick
@@ -155,6 +155,7 @@ def session_trial(session: Session, number: int, index: int) -> Trial:
         human_arm=np.concatenate([samples, np.repeat(samples[-1:], WINDOW, axis=0)]),
         robot_joints=np.full((len(samples) + WINDOW, len(names)), np.nan),  # nobody showed what to do instead
         robot_joint_names=names,
+        partner_arm=np.full((len(samples) + WINDOW, 3, 3), np.nan),
     )
 
 
@@ -176,7 +177,7 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
     active = np.array([each.active_state for each in said])
     n_rows, unknown = len(ticks), np.full(commanded.shape, np.nan)
     inference = Inference(
-        dataset=DATASET,
+        dataset=f"{DATASET}, as recorded",
         split="test",
         trial=index,
         action=header["action"],
@@ -185,7 +186,7 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
         joint_names=robot.chain.joint_names,
         time=np.array([tick.time for tick in ticks]) - ticks[0].time,
         observed=np.isfinite(human_mean).all(1) & np.array([tick_taken(tick) for tick in ticks]),
-        tracked=np.isfinite(arms.reshape(n_rows, -1)).all(axis=1),
+        tracked=observed_rows(arms.reshape(n_rows, -1)),
         log_alpha_human=np.array([each.log_alpha for each in said]),
         log_alpha_joint=joint_log_alpha(model, header["action"], human_mean, np.full_like(human_mean, np.nan)),
         log_alpha_unobserved=unobserved_forward(hmm, n_rows),
@@ -255,8 +256,18 @@ def _decision(tick: Tick) -> Decision:
 
 
 def _arm(tick: Tick) -> Float[np.ndarray, "3 3"]:
-    samples = _decision(tick).samples
-    return samples[-1] if samples else np.full((3, 3), np.nan)
+    """The arm as the model took it, else as it was sent, in the person's own frame; NaN where nothing came."""
+    decision = _decision(tick)
+    if decision.samples:
+        return decision.samples[-1]
+    if tick.seen is None:
+        return np.full((3, 3), np.nan)
+    return _in_person(tick, tick.seen.positions[joint_indices(tick.seen.names, ARM_JOINTS)])
+
+
+def _in_person(tick: Tick, points: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+    T = _decision(tick).T_world_person
+    return points if T is None else to_frame(T, points)
 
 
 def _skeleton(ticks: tuple[Tick, ...]) -> Skeleton | None:
@@ -267,6 +278,5 @@ def _skeleton(ticks: tuple[Tick, ...]) -> Skeleton | None:
     positions = np.full((len(ticks), len(names), 3), np.nan)
     for row, tick in zip(positions, ticks, strict=True):
         if tick.seen is not None and tick.seen.names == names:
-            T = _decision(tick).T_world_person
-            row[:] = tick.seen.positions if T is None else to_frame(T, tick.seen.positions)
+            row[:] = _in_person(tick, tick.seen.positions)
     return Skeleton(names, skeleton_bones(names), positions)

@@ -45,8 +45,7 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     if trial.phase is not None:
         return seen & (trial.phase == PHASES.index("contact"))
     if trial.T_world_human is not None and trial.T_world_partner is not None:
-        gap = in_frame(trial.T_world_human, human[:, 2]) - in_frame(trial.T_world_partner, partner[:, 2])
-        distance = np.linalg.norm(gap, axis=1)
+        distance = _wrist_distance(trial.T_world_human, human, trial.T_world_partner, partner)
         return seen & (distance <= np.nanmin(distance) + CLOSE)
     extension = np.minimum(_extension(human), _extension(partner))
     largest = np.nanquantile(extension, 0.98)
@@ -55,6 +54,24 @@ def contact_frames(trial: Trial) -> Bool[np.ndarray, " T"]:
     apart = partner[:, 2] - human[:, 2] * (-1.0, -1.0, 1.0)  # constant while facing people's wrists are together
     speed = np.linalg.norm(np.gradient(_smooth(apart), axis=0), axis=1) * trial.rate
     return seen & (extension >= EXTENDED * largest) & (speed < TOGETHER)
+
+
+def nearest_wrists(trial: Trial) -> int | None:
+    """The frame in which the partners' right wrists are nearest; None where they were not recorded in one world."""
+    T_world_human, T_world_partner, partner = trial.T_world_human, trial.T_world_partner, trial.partner_arm
+    if T_world_human is None or T_world_partner is None or partner is None:
+        return None
+    distance = _wrist_distance(T_world_human, trial.human_arm, T_world_partner, partner)
+    return None if np.isnan(distance).all() else int(np.nanargmin(distance))
+
+
+def _wrist_distance(
+    T_world_human: Float[np.ndarray, "4 4"],
+    human: Float[np.ndarray, "T 3 3"],
+    T_world_partner: Float[np.ndarray, "4 4"],
+    partner: Float[np.ndarray, "T 3 3"],
+) -> Float[np.ndarray, " T"]:
+    return np.linalg.norm(in_frame(T_world_human, human[:, 2]) - in_frame(T_world_partner, partner[:, 2]), axis=1)
 
 
 def suggest_contact_states(

@@ -68,6 +68,14 @@ class SafetySpec:
     `control.safety.RISE_TIME`."""
 
 
+@dataclass(frozen=True)
+class DynamicsSpec:
+    """What the simulation knows of a robot beside its description's masses and efforts."""
+
+    rotor_inertia: float = 0.0
+    """Inertia of a motor's rotor as its joint feels it, through the gears [kg m^2]; the same for every joint."""
+
+
 @dataclass(frozen=True, eq=False)
 class RobotSpec:
     """A robot as its folder describes it. The first arm is the one that interacts unless said otherwise."""
@@ -85,6 +93,7 @@ class RobotSpec:
     safety: SafetySpec = SafetySpec()
     robot_descriptions: str | None = None
     """Module of the package of that name that has the manufacturer's description."""
+    dynamics: DynamicsSpec = DynamicsSpec()
     file: Path | None = None
     """The robot.toml; None for a bare description."""
 
@@ -102,7 +111,9 @@ class RobotSpec:
         return self.main.end_effector
 
 
-KEYS = ("title", "description", "rest", "hands", "arms", "stiffness", "safety", "robot_descriptions")
+KEYS = (
+    "title", "description", "rest", "hands", "arms", "stiffness", "safety", "dynamics", "robot_descriptions",
+)  # fmt: skip
 ARM_KEYS: dict[str, Any] = {
     name: hint for name, hint in get_type_hints(ArmSpec).items() if name not in ("name", "position")
 }
@@ -144,6 +155,7 @@ def read_spec(folder: Path) -> RobotSpec:
         stiffness=_stiffness(table.get("stiffness", {}), f"{file}: stiffness"),
         safety=_safety(table.get("safety", {}), f"{file}: safety"),
         robot_descriptions=_module(table, f"{file}: robot_descriptions"),
+        dynamics=_dynamics(table.get("dynamics", {}), f"{file}: dynamics"),
         file=file,
     )
 
@@ -224,4 +236,11 @@ def _safety(value: Any, where: str) -> SafetySpec:
     if not (0.0 <= spec.margin <= 0.5 and (spec.acceleration is None or spec.acceleration > 0.0)):
         raise UserError(f"{where}: margin is {spec.margin}, acceleration {spec.acceleration}; valid: a margin of 0 to "
                         "0.5 rad, an acceleration above 0 rad/s^2")  # fmt: skip
+    return spec
+
+
+def _dynamics(value: Any, where: str) -> DynamicsSpec:
+    spec = DynamicsSpec(**_fields(value, get_type_hints(DynamicsSpec), where))
+    if not 0.0 <= spec.rotor_inertia < float("inf"):
+        raise UserError(f"{where}: rotor_inertia is {spec.rotor_inertia}; valid: a finite number of 0 or more kg m^2")
     return spec

@@ -34,6 +34,39 @@ class Joint:
         return "prismatic" if self.slides else "revolute"
 
 
+@dataclass(frozen=True)
+class Inertial:
+    """What a link weighs [kg], where its centre of mass is [m], and the size of the solid that stands for it [m].
+
+    The solid is a uniform elliptic cylinder: length along x, full width along y, full height along z.
+    """
+
+    mass: float
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+
+    @property
+    def moments(self) -> tuple[float, float, float]:
+        """Principal moments of inertia about the centre of mass, along x, y and z [kg m^2]."""
+        length, width, height = (extent * extent for extent in self.size)
+        return (
+            self.mass * (width + height) / 16.0,
+            self.mass * (length / 12.0 + height / 16.0),
+            self.mass * (length / 12.0 + width / 16.0),
+        )
+
+    def lines(self) -> list[str]:
+        """The <inertial> of a description."""
+        xx, yy, zz = (f"{moment:.4g}" for moment in self.moments)
+        return [
+            "    <inertial>",
+            f'      <origin xyz="{" ".join(f"{value:g}" for value in self.centre)}" rpy="0 0 0"/>',
+            f'      <mass value="{self.mass:g}"/>',
+            f'      <inertia ixx="{xx}" ixy="0" ixz="0" iyy="{yy}" iyz="0" izz="{zz}"/>',
+            "    </inertial>",
+        ]
+
+
 def ply(pieces: list[Piece]) -> bytes:
     """Binary PLY with a colour (sRGB) at every vertex."""
     welded = [weld(piece) for piece in pieces]
@@ -51,9 +84,16 @@ def ply(pieces: list[Piece]) -> bytes:
     return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
 
 
-def urdf(name: str, root: str, joints: Sequence[Joint], meshes: Mapping[str, str]) -> str:
+def urdf(
+    name: str,
+    root: str,
+    joints: Sequence[Joint],
+    meshes: Mapping[str, str],
+    inertials: Mapping[str, Inertial] | None = None,
+) -> str:
     """The text of the description of robot `name`; a link not in `meshes` is only a frame.
 
+    Only the links in `inertials` weigh anything.
     `meshes` names a mesh of the robot's own folder, or the file of another robot's relative to this one's.
     """
     lines = [
@@ -73,6 +113,7 @@ def urdf(name: str, root: str, joints: Sequence[Joint], meshes: Mapping[str, str
             f'        <mesh filename="{mesh if "/" in mesh else f"meshes/{mesh}.ply"}"/>',
             "      </geometry>",
             "    </visual>",
+            *(inertials[link].lines() if inertials and link in inertials else []),
             "  </link>",
         ]
     for joint in joints:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from modelling.description import ZERO, Joint, X, Y, Z
+from modelling.description import ZERO, Inertial, Joint, X, Y, Z
 from modelling.surfaces import Piece
 from pepper import arms, parts
 
@@ -48,6 +48,28 @@ JOINTS = [
     Joint("CameraBottom_sensor_fixedjoint", "Head", "CameraBottom_frame", ("0.09262", "0", "0.06177"),
           ("0", "0.698132", "0")),
 ]  # fmt: skip
+ARM_INERTIALS = {
+    "Shoulder": Inertial(0.3125, (0.00018, -0.01856, 0.00099), (0.08, 0.09, 0.075)),
+    "Bicep": Inertial(0.50527, (0.08151, 0.01284, -0.01017), (0.19, 0.08, 0.09)),
+    "Elbow": Inertial(0.27495, (-0.02297, -0.00019, 0.00119), (0.1, 0.065, 0.065)),
+    "ForeArm": Inertial(0.16579, (0.0593, 0.00271, -0.01014), (0.12, 0.07, 0.07)),
+    "wrist": Inertial(0.27555, (0.03536, -0.00072, -0.00207), (0.17, 0.08, 0.06)),
+}
+"""Of the left arm: mass and centre as its maker publishes them, size of the solid by our shapes (README.md)."""
+
+
+def inertials() -> dict[str, Inertial]:
+    """Of both arms' links; the right arm is the left one's mirror image."""
+    found = {}
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        for part, left in ARM_INERTIALS.items():
+            x, y, z = left.centre
+            name = f"{side.lower()}_{part}" if part == "wrist" else side + part
+            found[name] = Inertial(left.mass, (x, sign * y, z), left.size)
+    return found
+
+
+INERTIALS = inertials()
 STANDING = {"torso": 0.82, "Hip": 0.681, "Pelvis": 0.602, "Tibia": 0.334}
 """Height above the floor of the links whose shapes are drawn in the standing frame."""
 

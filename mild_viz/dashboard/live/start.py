@@ -16,6 +16,7 @@ from mild_viz.errors import UserError
 from mild_viz.live.config import LiveConfig
 from mild_viz.live.feed import Feed, channel, wait_for
 from mild_viz.live.loop import LiveLoop, Tick
+from mild_viz.robot.source import RobotSource
 from mild_viz.settings import ControlSettings
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class PageSetup:
     action: str
     robot: str | None
     """As `open_robot` takes it, like the next."""
-    robot_source: str
+    robot_source: RobotSource
     settings: ControlSettings
     T_world_human: Float[np.ndarray, "4 4"]
     config: LiveConfig

@@ -31,9 +31,9 @@ TEXTS = {rule.name: rule.text for rule in RULES}
 
 STATUS_CSS = """
 .mv-phase-now { display: inline-block; padding: 3px 10px; border-radius: 4px; color: #fff; font-weight: 600; }
-.mv-table { border-collapse: collapse; width: 100%; font-size: 12px; font-variant-numeric: tabular-nums; }
-.mv-table td { padding: 1px 4px 1px 0; vertical-align: top; }
-.mv-table td:last-child { text-align: right; white-space: nowrap; }
+.mv-figures { border-collapse: collapse; width: 100%; font-size: 12px; font-variant-numeric: tabular-nums; }
+.mv-figures td { padding: 1px 4px 1px 0; vertical-align: top; }
+.mv-figures td:last-child { text-align: right; white-space: nowrap; }
 .mv-status { padding: 0 12px 8px; font-size: 12px; line-height: 1.45; color: var(--mantine-color-text);
   overflow-wrap: anywhere; }
 .mv-status h4 { margin: 6px 0 2px; font-size: 12px; }
@@ -174,4 +174,4 @@ def times(value: Times) -> str:
 def table(rows: Iterable[tuple[str, object]]) -> str:
     """Two columns. Names are ours; values may hold our own markup."""
     body = "".join(f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in rows)
-    return f'<table class="mv-table">{body}</table>'
+    return f'<table class="mv-figures">{body}</table>'

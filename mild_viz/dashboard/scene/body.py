@@ -107,9 +107,14 @@ def stand(pelvis: Float[np.ndarray, " 3"], floor: float) -> Mesh:
     return vertices + pelvis, faces
 
 
-def support(pelvis: Float[np.ndarray, " 3"], left: Float[np.ndarray, " 3"], floor: float, height: float) -> Mesh | None:
-    """What carries the bust: legs where they would have a natural length, else a stand, or nothing to carry."""
+def support(
+    pelvis: Float[np.ndarray, " 3"], left: Float[np.ndarray, " 3"], floor: float, height: float, shortest: float = 0.85
+) -> Mesh | None:
+    """What carries the bust: legs where they would have a natural length, else a stand, or nothing to carry.
+
+    `shortest` is the least share of the natural length.
+    """
     share = (float(pelvis[2]) - floor) / ((COLLAR_SHARE - PELVIS_SHARE) * height)
-    if 0.85 <= share <= 1.15:
+    if shortest <= share <= 1.15:
         return legs(pelvis, left, floor, height)
     return stand(pelvis, floor) if share > 0.15 else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,8 +18,16 @@ ARM = ("right_shoulder", "right_elbow", "right_wrist")
 FACE = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")
 """Tracked points of the head that are drawn as small dots, without bones."""
 
+LEGS = ("_knee", "_ankle", "_foot", "_heel")
+
 ARM_RADII = (0.050, 0.041, 0.046)
 ARM_BONE_RADII = (0.040, 0.033)
+
+WALKS_FROM = 0.5
+"""Whose head wanders farther than this [m] walks: title and picture then follow."""
+
+CALM = 9
+"""Frames over which a title that follows a head is averaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +64,17 @@ class Figure:
         away = head - self.shoulders
         return head + away / max(float(np.linalg.norm(away)), 1e-6) * body.HEAD_RADIUS_SHARE * self.height
 
+    @cached_property
+    def walks(self) -> bool:
+        """Whether the person walks, rather than sways."""
+        return float(np.ptp(self.head_positions, axis=0).max()) > WALKS_FROM
+
+    @cached_property
+    def crowns(self) -> Float[np.ndarray, "N 3"]:
+        """The top of the head in every frame; one place for somebody who does not walk."""
+        away = self.head_positions - np.median(self.head_positions, axis=0)
+        return self.crown + (smoothed(away) if self.walks else np.zeros_like(away))
+
 
 def make_figure(inference: Inference) -> Figure:
     """All poses of one recording."""
@@ -63,6 +83,27 @@ def make_figure(inference: Inference) -> Figure:
     if skeleton is None or not set(ARM) <= set(skeleton.joint_names):
         return arm_figure(inference.human_arm, height)
     return skeleton_figure(skeleton, height)
+
+
+def partner_figure(inference: Inference) -> Figure | None:
+    """All poses of the second human of the recording, in that person's own frame; None without a whole skeleton.
+
+    Without the legs: those of the handovers' givers were guessed by the tracker (knees straight to half a degree,
+    feet up to half a metre above the other's floor), and the recording's own viewer leaves them out too.
+    """
+    skeleton = inference.partner_skeleton
+    if skeleton is None or not set(ARM) <= set(skeleton.joint_names):
+        return None
+    skeleton = without(skeleton, LEGS)
+    arm = skeleton.positions[:, [skeleton.joint_names.index(name) for name in ARM]]
+    return skeleton_figure(skeleton, body.stature(arm))
+
+
+def without(skeleton: Skeleton, parts: tuple[str, ...]) -> Skeleton:
+    """A skeleton without the joints of both sides that are named so."""
+    kept = [i for i, name in enumerate(skeleton.joint_names) if not name.endswith(parts)]
+    bones = tuple((kept.index(a), kept.index(b)) for a, b in skeleton.bones if a in kept and b in kept)
+    return Skeleton(tuple(skeleton.joint_names[i] for i in kept), bones, skeleton.positions[:, kept])
 
 
 def arm_figure(arm: Float[np.ndarray, "N 3 3"], height: float) -> Figure:
@@ -85,8 +126,18 @@ def skeleton_figure(skeleton: Skeleton, height: float) -> Figure:
     radii = np.array([0.012 if name in FACE else 0.027 for name in names])
     radii[arm] = ARM_RADII
     poses = torso_poses(skeleton)
-    head = positions[:, names.index("head")] if "head" in names else poses[:, 4:] + [0.0, 0.0, body.HEAD_SHARE * height]
-    return assemble(positions, bones, bone_radii, radii, poses, held(head), height, arm, soles(skeleton, height))
+    return assemble(
+        positions, bones, bone_radii, radii, poses, held(heads(skeleton, poses, height)), height, arm,
+        soles(skeleton, height),
+    )  # fmt: skip
+
+
+def heads(skeleton: Skeleton, poses: Float[np.ndarray, "N 7"], height: float) -> Float[np.ndarray, "N 3"]:
+    """The middle of the head: between the ears where they were tracked (what is called head then is the chin's)."""
+    names, positions = skeleton.joint_names, skeleton.positions
+    if {"left_ear", "right_ear"} <= set(names):
+        return 0.5 * (positions[:, names.index("left_ear")] + positions[:, names.index("right_ear")])
+    return positions[:, names.index("head")] if "head" in names else poses[:, 4:] + [0.0, 0.0, body.HEAD_SHARE * height]
 
 
 def torso_poses(skeleton: Skeleton) -> Float[np.ndarray, "N 7"]:
@@ -156,6 +207,13 @@ def held(values: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
         return np.zeros_like(values)
     last = np.maximum.accumulate(np.where(seen, np.arange(len(values)), -1))
     return values[np.where(last < 0, seen.argmax(), last)]
+
+
+def smoothed(track: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Mean over the `CALM` frames about each, fewer at the ends."""
+    weights = np.ones(min(CALM, len(track)))
+    counts = np.convolve(np.ones(len(track)), weights, mode="same")
+    return np.stack([np.convolve(column, weights, mode="same") for column in track.T], axis=1) / counts[:, None]
 
 
 def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import viser
+from jaxtyping import Float
 
 from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.dashboard.scene.shapes import Mesh, loft
 
 LOWEST_PEDESTAL = 0.03
 """A smaller step between floor and robot [m] is not worth a pedestal."""
+
+
+TALL, NARROW = 0.6, 0.25
+"""A pedestal from this height on [m], under a robot that reaches less far from its axis, is a stand."""
 
 
 class GroundView:
@@ -22,8 +27,9 @@ class GroundView:
         self._pedestal: viser.MeshHandle | None = None
         self._shown: tuple[float, float, Palette, bool] | None = None
 
-    def show(self, floor: float, robot_bottom: float, colors: Palette, robot_visible: bool) -> None:
-        """Floor and pedestal at these heights [m]; the pedestal goes with the robot."""
+    def show(self, floor: float, robot: Float[np.ndarray, "2 3"], colors: Palette, robot_visible: bool) -> None:
+        """A floor at this height, and a pedestal up to the robot, of these bounds [m]; it goes with the robot."""
+        robot_bottom, footprint = float(robot[0, 2]), float(np.abs(robot[:, :2]).max())
         shown = (floor, robot_bottom, colors, robot_visible)
         if shown == self._shown:
             return
@@ -40,7 +46,7 @@ class GroundView:
             self._pedestal = None
         if robot_visible and robot_bottom - floor > LOWEST_PEDESTAL:
             self._pedestal = self._server.scene.add_mesh_simple(
-                "/ground/pedestal", *pedestal(floor, robot_bottom), color=colors.pedestal, cast_shadow=False,
+                "/ground/pedestal", *pedestal(floor, robot_bottom, footprint), color=colors.pedestal, cast_shadow=False,
                 receive_shadow=False,
             )  # fmt: skip
 
@@ -58,10 +64,16 @@ def light(server: viser.ViserServer) -> None:
     scene.add_light_directional("/ground/fill", intensity=0.35, position=(-2.5, -1.0, 1.5))
 
 
-def pedestal(floor: float, top: float) -> Mesh:
-    """A round podium with a softened edge [m]."""
-    edge = 0.012
-    radius = np.array([0.345, 0.345, 0.345 - edge])
-    z = np.array([floor, top - edge, top])
-    zero = np.zeros(3)
+def pedestal(floor: float, top: float, footprint: float) -> Mesh:
+    """A round podium with a softened edge, or a slim stand where it is tall and the robot narrow [m]."""
+    edge, wide = 0.012, 0.345
+    if top - floor > TALL and footprint < NARROW:
+        plate, post = footprint + 0.04, 0.07
+        radius = np.array([wide, wide, wide - edge, post + 0.03, post, post, plate - 0.02, plate, plate, plate - edge])
+        z = np.array([0.0, 0.03, 0.03 + edge, 0.05, 0.08, -0.09, -0.05, -0.04, -edge, 0.0])
+        z += np.where(np.arange(len(z)) < 5, floor, top)
+    else:
+        radius = np.array([wide, wide, wide - edge])
+        z = np.array([floor, top - edge, top])
+    zero = np.zeros(len(z))
     return loft(np.stack([z, radius, radius, zero, zero], 1), sides=72)

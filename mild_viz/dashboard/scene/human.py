@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from mild_viz.dashboard.scene import body
 from mild_viz.dashboard.scene.figure import Figure
 from mild_viz.dashboard.scene.labels import NOTE, add_label, add_title
+from mild_viz.dashboard.scene.layout import TITLE_GAP
 from mild_viz.dashboard.scene.palette import Palette, linear
 from mild_viz.dashboard.scene.shapes import Mesh, ball, limb, quaternion_from_matrix
 
@@ -47,7 +48,7 @@ class HumanView:
             if last is not None:  # nodes replaced under their names would be drawn with the old count for a moment
                 self._limbs.remove()
                 self._balls.remove()
-            self._add_observed(figure)
+            self._limbs, self._balls = add_observed(self._server, ROOT, figure)
         if last is None or last.height != figure.height or last.whole != figure.whole:
             self._add_part("torso", body.torso(figure.height))
             self._add_part("head", body.head(figure.height))
@@ -65,28 +66,14 @@ class HumanView:
         figure = self._figure
         if figure is None:
             return
-        self._limbs.batched_positions = figure.limb_positions[n]
-        self._limbs.batched_wxyzs = figure.limb_wxyzs[n]
-        self._limbs.batched_scales = figure.limb_scales[n]
-        self._balls.batched_positions = figure.ball_positions[n]
-        self._balls.batched_scales = figure.ball_scales[n]
+        pose_observed(self._limbs, self._balls, figure, n)
         torso, head = self._schematic["torso"], self._schematic["head"]
         torso.wxyz = head.wxyz = figure.torso_poses[n, :4]
         torso.position = figure.torso_poses[n, 4:]
         head.position = figure.head_positions[n]
         self._lost.visible = not bool(self._tracked[n])
-
-    def _add_observed(self, figure: Figure) -> None:
-        scene, still = self._server.scene, np.array([1.0, 0.0, 0.0, 0.0])
-        self._limbs = scene.add_batched_meshes_simple(
-            f"{ROOT}/limbs", *limb(), batched_wxyzs=figure.limb_wxyzs[0], batched_positions=figure.limb_positions[0],
-            batched_scales=figure.limb_scales[0], lod="off", cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
-        self._balls = scene.add_batched_meshes_simple(
-            f"{ROOT}/joints", *ball(), batched_wxyzs=np.tile(still, (len(figure.ball_feeds), 1)),
-            batched_positions=figure.ball_positions[0], batched_scales=figure.ball_scales[0], lod="off",
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+        if figure.walks:
+            self._title.position = self._caption.position = figure.crowns[n] + [0.0, 0.0, TITLE_GAP]
 
     def _add_part(self, name: str, mesh: Mesh | None) -> None:
         """Add, replace or take away one schematic part."""
@@ -110,8 +97,7 @@ class HumanView:
 
     def _place_labels(self, figure: Figure) -> None:
         middle, height = figure.shoulders, figure.height
-        crown = figure.crown
-        self._title.position = self._caption.position = crown + [0.0, 0.0, 0.13]
+        self._title.position = self._caption.position = figure.crowns[0] + [0.0, 0.0, TITLE_GAP]
         self._lost.position = middle + [0.0, 0.0, -0.14 * height]
         whole = "red arm: model input" if figure.soles is not None else "red arm: model input, pale: schematic"
         self._caption.text = whole if figure.whole else "right arm observed, rest schematic"
@@ -119,12 +105,38 @@ class HumanView:
             self._schematic["left_arm"].position = middle
 
 
-def support(figure: Figure, T_world_human: Float[np.ndarray, "4 4"], floor: float) -> Mesh | None:
+def add_observed(
+    server: viser.ViserServer, root: str, figure: Figure, opacity: float | None = None
+) -> tuple[viser.BatchedMeshHandle, viser.BatchedMeshHandle]:
+    """The recorded limbs and joints of a figure, under a frame named `root`."""
+    scene, still = server.scene, np.array([1.0, 0.0, 0.0, 0.0])
+    limbs = scene.add_batched_meshes_simple(
+        f"{root}/limbs", *limb(), batched_wxyzs=figure.limb_wxyzs[0], batched_positions=figure.limb_positions[0],
+        batched_scales=figure.limb_scales[0], lod="off", opacity=opacity, cast_shadow=False, receive_shadow=False,
+    )  # fmt: skip
+    balls = scene.add_batched_meshes_simple(
+        f"{root}/joints", *ball(), batched_wxyzs=np.tile(still, (len(figure.ball_feeds), 1)),
+        batched_positions=figure.ball_positions[0], batched_scales=figure.ball_scales[0], lod="off", opacity=opacity,
+        cast_shadow=False, receive_shadow=False,
+    )  # fmt: skip
+    return limbs, balls
+
+
+def pose_observed(limbs: viser.BatchedMeshHandle, balls: viser.BatchedMeshHandle, figure: Figure, n: int) -> None:
+    """Put the recorded limbs and joints where they were in frame n."""
+    limbs.batched_positions, limbs.batched_wxyzs = figure.limb_positions[n], figure.limb_wxyzs[n]
+    limbs.batched_scales = figure.limb_scales[n]
+    balls.batched_positions, balls.batched_scales = figure.ball_positions[n], figure.ball_scales[n]
+
+
+def support(
+    figure: Figure, T_world_human: Float[np.ndarray, "4 4"], floor: float, shortest: float = 0.85
+) -> Mesh | None:
     """Legs or a stand, upright in world, in the human's frame."""
     R, t = T_world_human[:3, :3], T_world_human[:3, 3]
     pelvis = R @ (figure.shoulders - [0.0, 0.0, body.PELVIS_SHARE * figure.height]) + t
     left = R[:, 1] * [1.0, 1.0, 0.0]
-    mesh = body.support(pelvis, left / np.linalg.norm(left), floor, figure.height)
+    mesh = body.support(pelvis, left / np.linalg.norm(left), floor, figure.height, shortest)
     return None if mesh is None else ((mesh[0] - t) @ R, mesh[1])
 
 

@@ -24,6 +24,10 @@ VIEWER = np.array([-0.12, -0.97, 0.19])
 FIELD_OF_VIEW = np.radians(28.0)
 """Vertical field of view: narrow, so that figures at the sides of the picture do not lean outwards."""
 
+CAPTION_SHARES = 0.14, 0.18
+"""Half of the robot's and of the plot's caption, as a share of what a picture of all groups is wide: texts have a
+size in pixels, so that those of a wide scene reach farther [m]."""
+
 WIDEST = 1.85
 """Width over height of a canvas that just shows all three groups; one that is wider needs no more distance."""
 
@@ -55,6 +59,8 @@ class Layout:
     hand: Vector
     """Where the hands are at their nearest."""
     floor: float
+    walk: Float[np.ndarray, "W 3"]
+    """Where the crown of the human's head is on the way, of one who walks."""
     plot_centre: Vector
     plot_yaw: float
 
@@ -62,6 +68,11 @@ class Layout:
     def side(self) -> Vector:
         """Horizontal unit vector from the dyad to the viewer: the robot's right, where its moving arm is."""
         return np.array([self.forward[1], -self.forward[0], 0.0])
+
+    @property
+    def span(self) -> float:
+        """What a picture of all groups is wide, about [m]."""
+        return float(self.plot_centre @ self.forward) + 1.5
 
     @property
     def human_title(self) -> Vector:
@@ -86,15 +97,17 @@ def make_layout(
     human_eye: Vector,
     hand: Vector,
     floor: float,
+    walk: Float[np.ndarray, "W 3"] | None = None,
 ) -> Layout:
     """The layout of a dyad: the plot stands beyond the human, a little turned towards the dyad's viewer."""
+    walk = human_top[None] if walk is None else walk
     away = human_top * [1.0, 1.0, 0.0]  # not where the human's frame is: one who walks leaves it behind
     distance = float(np.linalg.norm(away))
     forward = away / distance if distance > 0.1 else np.array([1.0, 0.0, 0.0])
-    centre = forward * (max(distance, 0.75) + 1.40)
+    centre = forward * (max(distance, 0.75, float((walk @ forward).max())) + 1.40)
     centre[2] = floor + 0.98
     yaw = float(np.arctan2(forward[1], forward[0])) + PLOT_TURN
-    return Layout(forward, robot_top, human_top, human_eye, hand, floor, centre, yaw)
+    return Layout(forward, robot_top, human_top, human_eye, hand, floor, walk, centre, yaw)
 
 
 def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 0.0) -> Camera:
@@ -104,14 +117,16 @@ def camera(name: str, layout: Layout, aspect: float = WIDEST, headroom: float = 
     if name == "participant":
         return over_shoulder(layout, aspect)
     plot = plot_points(layout) + [layout.plot_title + (0.12 + headroom) * up]
+    robot_text, plot_text = (share * layout.span * layout.forward for share in CAPTION_SHARES)
     if name == "latent":
         direction = layout.side - 0.30 * layout.forward + 0.20 * up  # across the box, with a gap before the dyad
-        return beside(layout.human_top, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
-    foot = layout.human_top * [1.0, 1.0, 0.0] + floor * up
-    dyad = [layout.robot_title + (0.14 + headroom) * up - 0.5 * layout.forward]
-    dyad += [layout.human_title + (0.14 + headroom) * up + 0.26 * layout.forward]
+        nearest = layout.walk[int((layout.walk @ layout.forward).argmax())]
+        return beside(nearest, fitted(np.array(plot), direction, aspect, 0.015), plot, aspect)
+    dyad = [layout.robot_title + (0.14 + headroom) * up - robot_text, layout.plot_title + plot_text]
+    dyad += [top + (TITLE_GAP + 0.14 + headroom) * up + 0.26 * layout.forward for top in layout.walk]
     dyad += [floor * up + 0.36 * (b * layout.side - layout.forward) for b in (-1, 1)]
-    dyad += [foot + 0.24 * (b * layout.side + layout.forward) for b in (-1, 1)]
+    feet = layout.walk * [1.0, 1.0, 0.0] + floor * up
+    dyad += [foot + 0.24 * (b * layout.side + layout.forward) for foot in feet for b in (-1, 1)]
     oblique = -0.55 * layout.forward + 0.38 * up if name == "experimenter" else 0.20 * up
     return fitted(np.array(dyad + plot), layout.side + oblique, aspect, margin=0.02)
 
@@ -133,7 +148,8 @@ def plot_points(layout: Layout) -> list[Vector]:
 def over_shoulder(layout: Layout, aspect: float) -> Camera:
     """What the person sees: just before the right eye, so that neither head nor title is in the way."""
     up = np.array([0.0, 0.0, 1.0])
-    eye = layout.human_eye - 0.12 * layout.forward - 0.10 * layout.side + 0.05 * up
+    ahead = unit((layout.robot_top - layout.human_eye) * [1.0, 1.0, 0.0])
+    eye = layout.human_eye + 0.12 * ahead + 0.10 * np.cross(ahead, up) + 0.05 * up
     wanted = np.array([layout.robot_top + 0.10 * up, layout.hand - 0.22 * up])
     ahead = unit(wanted[0] - eye) + unit(wanted[1] - eye)
     towards = -unit(ahead)

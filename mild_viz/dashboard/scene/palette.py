@@ -56,6 +56,8 @@ class Palette:
     grid: Rgb
     grid_section: Rgb
     pedestal: Rgb
+    object: Rgb
+    """What is handed over."""
     frame: Rgb
     """Edges of the latent plot's box."""
 
@@ -79,6 +81,7 @@ LIGHT = Palette(
     grid=rgb("#E7EAEE"),
     grid_section=rgb("#D3D8DF"),
     pedestal=rgb("#C9CFD6"),
+    object=rgb("#E0A100"),
     frame=rgb("#9AA4B1"),
 )
 
@@ -96,6 +99,7 @@ DARK = Palette(
     grid=rgb("#444D59"),
     grid_section=rgb("#525C69"),
     pedestal=rgb("#5E6874"),
+    object=rgb("#F2C033"),
     frame=rgb("#8792A1"),
 )
 
@@ -104,6 +108,9 @@ CONTROLLER_COLORS: dict[str, Rgb] = {
     "base-ik": rgb("#E69F00"), "mild": rgb("#8250C8"), "mild-ik": rgb("#009E73"),
 }  # fmt: skip
 """Colour of each controller's ghost where several are compared, on either background."""
+
+SIMULATED, FORCE = rgb("#12B5CB"), rgb("#E8590C")
+"""The simulated arm's ghost, and the force between the hands, on either background."""
 
 
 def palette(dark: bool) -> Palette:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -110,6 +110,13 @@ class RobotView:
         self._pose(self._solid, still, frames.poses[0])
         self._title.position = self._caption.position = title
         self._caption.text = f"{controller} command" + (" · pale: decoded, before IK" if self._show_ghost else "")
+
+    def show_command(self, poses: Float[np.ndarray, "N L 7"], caption: str) -> None:
+        """Draw these poses of the same links as the command, under this caption, until the next `show`."""
+        self._caption.text = caption
+        if self._frames is not None and poses is not self._frames.poses:
+            moving = tuple(sorted({*self._frames.moving, *moving_links(poses)}))
+            self._frames = replace(self._frames, poses=poses, moving=moving)
 
     def set_frame(self, n: int) -> None:
         """Show frame n."""

@@ -11,8 +11,11 @@ from jaxtyping import Float
 
 from mild_viz.dashboard.scene import body
 from mild_viz.dashboard.scene.compared import ComparedView
-from mild_viz.dashboard.scene.figure import Figure, make_figure
+from mild_viz.dashboard.scene.compliance import ComplianceFrames, ComplianceView
+from mild_viz.dashboard.scene.figure import Figure, make_figure, partner_figure
+from mild_viz.dashboard.scene.giver import GiverView
 from mild_viz.dashboard.scene.ground import GroundView
+from mild_viz.dashboard.scene.handed import HandedView, handed_frames
 from mild_viz.dashboard.scene.human import HumanView
 from mild_viz.dashboard.scene.latent import LatentFrames, LatentView, latent_frames
 from mild_viz.dashboard.scene.layout import CAMERAS, WIDEST, Camera, Layout, camera, make_layout
@@ -21,6 +24,7 @@ from mild_viz.dashboard.scene.reach import ReachView
 from mild_viz.dashboard.scene.robot import RobotView, robot_frames
 from mild_viz.dashboard.scene.volume import VolumeView
 from mild_viz.dashboard.view import ViewSettings
+from mild_viz.robot.contact import in_frame
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 
@@ -43,6 +47,9 @@ class Scene:
         self._ground = GroundView(server)
         colors = palette(dark)
         self._human = HumanView(server, colors)
+        self._giver = GiverView(server)
+        self._giver_figure: Figure | None = None
+        self._handed = HandedView(server)
         self._make_robot_views(robot)
         self._latent = LatentView(server, colors)
         self._reach = ReachView(server)
@@ -52,6 +59,7 @@ class Scene:
         self._robot = RobotView(self._server, robot.visuals, robot.link_names, robot.title)
         self._compared = ComparedView(self._server, robot.visuals, robot.link_names)
         self._volume = VolumeView(self._server, robot.chain)
+        self._compliance = ComplianceView(self._server, robot.visuals, robot.link_names)
 
     def set_robot(self, robot: RobotModel) -> None:
         """Draw another robot from the next `show` on; the same one changes nothing."""
@@ -60,7 +68,7 @@ class Scene:
         _ = robot.visuals  # a mesh that cannot be read must not leave the scene without a robot
         with self._lock, self._server.atomic():
             self._rollout = None  # it has poses of other links
-            for view in (self._robot, self._compared, self._volume):
+            for view in (self._robot, self._compared, self._volume, self._compliance):
                 view.remove()
             self._make_robot_views(robot)
 
@@ -82,24 +90,38 @@ class Scene:
             figure = make_figure(inference)
         if frames is None or inference is not last or latent_view(view) != latent_view(self._view):
             frames = latent_frames(inference, view)
+        giver = partner_figure(inference) if inference is not last else self._giver_figure
+        handed = handed_frames(rollout, view.show_robot)
         arms = robot_frames(rollout)
         bounds = self._robot.bounds(rollout)
         layout = scene_layout(rollout, figure, bounds)
         colors = palette(view.dark)
         with self._lock, self._server.atomic():
-            self._ground.show(layout.floor, float(bounds[0, 2]), colors, view.show_robot)
+            self._ground.show(layout.floor, bounds, colors, view.show_robot)
             if self._layout is None:
                 fill_initial_camera(self._server, camera("both", layout))
             self._rollout, self._view, self._layout = rollout, view, layout
             self._human.show(figure, rollout.T_world_human, layout.floor, colors, view.show_human, inference.tracked)
-            ghost = view.ghost and not compared  # of too many arms none can be told apart
+            self._compliance.clear()
+            # of too many arms none can be told apart
+            ghost = view.ghost and not compared and view.compliance is None
             self._robot.show(arms, layout.robot_title, rollout.controller, colors, view.show_robot, ghost)
             self._compared.show([one for one in compared if one.controller != rollout.controller], view.show_robot)
             self._volume.show(colors, view.show_reach and view.show_robot)
             self._reach.show(rollout, colors, view.show_human and view.show_robot)
             self._latent.show(frames, layout, colors, view.show_latent)
-            self._figure, self._latent_frames = figure, frames
+            self._giver.show(giver, rollout, layout.floor, colors, view.show_giver)
+            self._handed.show(handed, inference.time, colors)
+            self._figure, self._giver_figure, self._latent_frames = figure, giver, frames
             self._set_frame(min(self._frame, inference.n_windows - 1))
+
+    def show_compliance(self, frames: ComplianceFrames) -> None:
+        """Also draw a simulation of the rollout that is shown, until the next `show`; the solid arm is its command."""
+        with self._lock, self._server.atomic():
+            if self._rollout is not None and self._view is not None and len(frames.texts) == len(self._rollout.contact):
+                self._compliance.show(frames, self._view.show_robot)
+                self._robot.show_command(frames.command_poses, frames.caption)
+                self._set_frame(self._frame)
 
     def set_frame(self, n: int) -> None:
         """Show frame n; one beyond the end shows the last."""
@@ -141,7 +163,10 @@ class Scene:
     def _set_frame(self, n: int) -> None:
         self._frame = n
         self._human.set_frame(n)
+        self._giver.set_frame(n)
+        self._handed.set_frame(n)
         self._robot.set_frame(n)
+        self._compliance.set_frame(n)
         self._compared.set_frame(n)
         self._reach.set_frame(n)
         self._latent.set_frame(n)
@@ -183,12 +208,17 @@ def scene_layout(rollout: Rollout, figure: Figure, bounds: Float[np.ndarray, "2 
     T = rollout.T_world_human
     up = T[:3, :3].T @ [0.0, 0.0, 1.0]
     middle, height = figure.shoulders, figure.height
+    distance = np.where(np.isfinite(rollout.hand_distance), rollout.hand_distance, np.inf)
+    nearest = int(distance.argmin())
     crown, eye, sole = (
         T[:3, :3] @ point + T[:3, 3]
-        for point in (figure.crown, figure.crown - 0.07 * height * up, middle - body.COLLAR_SHARE * height * up)
-    )
+        for point in (
+            figure.crown, figure.crowns[nearest] - 0.07 * height * up, middle - body.COLLAR_SHARE * height * up
+        )
+    )  # fmt: skip
     feet = float(sole[2]) if figure.soles is None else float((T[:3, :3] @ figure.soles + T[:3, 3])[2])
-    distance = np.where(np.isfinite(rollout.hand_distance), rollout.hand_distance, np.inf)
-    hand = np.nan_to_num(rollout.target[int(distance.argmin())])
-    robot_top = np.array([0.0, 0.0, bounds[1, 2]])
-    return make_layout(robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet))
+    hand = np.nan_to_num(rollout.target[nearest])
+    arm_top = float(np.median(rollout.link_poses[:, :, 6].max(axis=1)))  # an arm without a body stands above its base
+    robot_top = np.array([0.0, 0.0, max(bounds[1, 2], arm_top)])
+    walk = in_frame(T, figure.crowns[:: max(1, len(figure.crowns) // 16)]) if figure.walks else crown[None]
+    return make_layout(robot_top, crown, eye, hand, min(float(bounds[0, 2]), feet), walk)

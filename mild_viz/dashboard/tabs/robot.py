@@ -8,9 +8,11 @@ import numpy as np
 import viser
 
 from mild_viz.checkpoint import Checkpoint
-from mild_viz.dashboard.tabs.widgets import Changed, number, on_person, option, sentence, set_content, widget_id
+from mild_viz.dashboard.tabs.widgets import Changed, number, offer, on_person, option, sentence, set_content, widget_id
+from mild_viz.robot.control.other_arm import other_arm_options
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
-from mild_viz.settings import CONTROLLERS_OF, ControlSettings, Placement
+from mild_viz.settings import CONTROLLERS_OF, OTHER_ARM, ControlSettings, Placement
 from mild_viz.trial import Trial
 
 WEIGHT_EXPONENTS = (-4.0, 2.0)
@@ -23,12 +25,15 @@ REACH = 0.5
 class RobotTab:
     """Widgets of `ControlSettings`, but for the contact states."""
 
-    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
-        default = ControlSettings()
+    def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
             hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states. "
             "task-space: both arms to the decoded hands.",
+        )  # fmt: skip
+        self._other_arm = gui.add_dropdown(
+            "Other arm", OTHER_ARM, initial_value=default.other_arm,
+            hint="rest. mild: mirrors the decoded joints. base-ik: follows the human's left hand. mild-ik: both.",
         )  # fmt: skip
         self._lambda_x = self._weight(gui, "λx", default.lambda_x, "Weight of reaching the hand (power of ten).")
         self._lambda_q = self._weight(gui, "λq", default.lambda_q, "Weight of staying at the decoded joints.")
@@ -55,7 +60,7 @@ class RobotTab:
         self._chosen: Placement | None = None
         self._to_reset = False
         self._of: tuple[object, ...] = ()
-        widgets = (self._controller, self._lambda_x, self._lambda_q, self._smoothing, self._stiffness)
+        widgets = (self._controller, self._other_arm, self._lambda_x, self._lambda_q, self._smoothing, self._stiffness)
         for handle in (*widgets, *self._place.values()):
             on_person(handle, changed)
 
@@ -78,12 +83,18 @@ class RobotTab:
         )
         return slider
 
-    def read(self, checkpoint: Checkpoint, trial: Trial, contact_states: frozenset[int]) -> ControlSettings:
-        """The chosen settings. The placement is the trial's own until a person moves it."""
+    def read(
+        self, checkpoint: Checkpoint, trial: Trial, robot: RobotModel, contact_states: frozenset[int]
+    ) -> ControlSettings:
+        """The chosen settings, of what this robot and model can do. The placement is the trial's own until a person
+        moves it."""
         controllers = CONTROLLERS_OF[checkpoint.decodes]
-        if tuple(self._controller.options) != controllers:
-            self._controller.options = controllers
-            self._controller.value = controllers[-1]
+        chosen = option(self._controller)
+        offer(self._controller, controllers, chosen if chosen in controllers else controllers[-1])
+        # A model of two hands moves both arms itself.
+        others = ("rest",) if checkpoint.decodes == "hands" else other_arm_options(robot, trial.human_skeleton)
+        self._other_arm.disabled = len(others) < 2
+        offer(self._other_arm, others or ("rest",))
         weights = {}
         for name, slider in (("λx", self._lambda_x), ("λq", self._lambda_q)):
             weights[name] = float(f"{10.0 ** number(slider):.3g}")
@@ -92,6 +103,7 @@ class RobotTab:
                 slider.label = label
         return ControlSettings(
             controller=option(self._controller),
+            other_arm=option(self._other_arm),
             lambda_x=weights["λx"],
             lambda_q=weights["λq"],
             contact_states=contact_states,

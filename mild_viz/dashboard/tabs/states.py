@@ -36,6 +36,8 @@ class StatesTab:
         self._folder = gui.add_folder(None)
         self._boxes: list[viser.GuiCheckboxHandle] = []
         self._of: tuple[object, ...] = ()
+        self._unsaved: dict[tuple[object, ...], frozenset[int]] = {}
+        """Ticks of what was shown before, for when a person comes back to it."""
         self.save = gui.add_button(
             "Save contact states", icon=viser.Icon.DEVICE_FLOPPY,
             hint=SAVE_NOTE,
@@ -56,14 +58,19 @@ class StatesTab:
             box.visible = state < n_states
 
     def read(self, checkpoint: Checkpoint, variant: str, action: str) -> frozenset[int]:
-        """The ticked states. Another model or action brings its own default."""
+        """The ticked states. Another model or action brings what was last ticked for it, at first its own default."""
         human = checkpoint.members(variant)[0].human_vae
         if len(self._boxes) < checkpoint.n_states or self._of[:1] != (human,):
             self._build(checkpoint.n_states)
         if self._of != (human, action):
+            if self._of:
+                self._unsaved[self._of] = self._ticked()
             self._of = (human, action)
-            self.tick(checkpoint.contact_states_of(variant, action))
-        return frozenset(state for state in range(checkpoint.n_states) if self._boxes[state].value)
+            self.tick(self._unsaved.get(self._of, checkpoint.contact_states_of(variant, action)))
+        return self._ticked() & frozenset(range(checkpoint.n_states))
+
+    def _ticked(self) -> frozenset[int]:
+        return frozenset(state for state, box in enumerate(self._boxes) if box.value)
 
     def tick(self, states: frozenset[int]) -> None:
         for state, box in enumerate(self._boxes):

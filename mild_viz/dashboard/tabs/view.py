@@ -56,10 +56,15 @@ class ViewTab:
             group: gui.add_checkbox(f"Show {group}", True, hint=f"Draw the {group}.")
             for group in ("human", "robot", "latent plot")
         }
+        self._giver = gui.add_checkbox(
+            "Show giver", default.show_giver, visible=False,
+            hint="Draw the recorded giver, grey (legs schematic), in the robot's place. The object is in the robot's "
+            "hand until the recorded transfer, then as recorded; without the robot it is as recorded all along.",
+        )  # fmt: skip
         self._axis_names = ["z0", "z1", "z2"]
         """What the axes were at the last reading."""
         widgets = (self._theme, self._alpha, self._sigma, self._axes, *self._dimensions, self._ghost, self._reach)
-        for handle in (*widgets, *self._visible.values()):
+        for handle in (*widgets, self._giver, *self._visible.values()):
             on_person(handle, changed)
 
         @self._camera.on_click
@@ -90,13 +95,15 @@ class ViewTab:
             ghost=bool(self._ghost.value),
             show_reach=bool(self._reach.value),
             show_human=human,
+            show_giver=bool(self._giver.value),
             show_robot=robot,
             show_latent=latent,
             dark=option(self._theme) == "dark",
         )
 
     def show(self, rollout: Rollout) -> None:
-        """Offer the latent dimensions that the model has."""
+        """Offer the latent dimensions that the model has, and the giver where one was recorded in the same world."""
+        self._giver.visible = rollout.T_world_partner is not None and rollout.inference.partner_skeleton is not None
         n_dimensions = rollout.inference.human_latent_mean.shape[1]
         names = [f"z{i}" for i in range(n_dimensions)]
         for handle in self._dimensions:

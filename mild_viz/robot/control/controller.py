@@ -92,7 +92,8 @@ class Controller:
 
     Controllers: `mild` sends the decoded joints; `mild-ik` adapts them by IK in the contact states, with
     the decoded joints as prior (Algorithm vae-HMM-test); `base-ik` follows the hand at every frame by IK
-    without a prior, from the previous command on (Eq. ik-plain). A NaN target means no IK in that frame. IK
+    without the model, from the previous command on, which a weight of 1e-3 lambda_x keeps it near, so that it does not
+    leap at the border of reach (Eq. ik-plain). A NaN target means no IK in that frame. IK
     goes no farther in a frame than the joints' velocity limits admit.
 
     The wanted joints are smoothed by a weighted moving average; the safety filter makes the command of them.

@@ -18,6 +18,9 @@ from mild_viz.robot.objective.kernels import plain_terms
 BASE_IK, MILD, MILD_IK = 0, 1, 2
 """Controllers, in the order of `settings.CONTROLLERS`."""
 
+FOLLOWING = 1e-3
+"""Pull of base-ik to its last command, as a share of lambda_x: without, an arm leaps at the border of its reach."""
+
 CONTROLLER, CONTACT_STATES, COMPLIANT, NO_RETURN, IK_CROSSED = 0, 1, 2, 3, 4
 """Slots of the choices, whole numbers; contact states are a bit mask."""
 
@@ -262,7 +265,9 @@ def control_loop(
             crossed = choices[IK_CROSSED] == 1 and flags[PROGRESS] != REACHING
             doubt = choices[CONTACT_STATES] != 0 and math.exp(log_alpha[k, active]) < numbers[DOUBT]
             adapt = controller == BASE_IK or (controller == MILD_IK and (contact[k] or crossed or doubt))
-            prior, weight = (motion[JOINTS], 0.0) if controller == BASE_IK else (decoded[k], numbers[LAMBDA_Q])
+            prior, weight = decoded[k], numbers[LAMBDA_Q]
+            if controller == BASE_IK:
+                prior, weight = motion[JOINTS], FOLLOWING * numbers[LAMBDA_X]
             if adapt and _finite(target):
                 for i in range(size):
                     steps[i] = limits[VELOCITY, i] * dt

@@ -15,6 +15,7 @@ from mild_viz.robot.control.controller import Controller, Frames, make_controlle
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import OtherArm
+from mild_viz.settings import OTHER_ARM
 from mild_viz.trial import Skeleton
 
 LEFT_HAND = "left_wrist"
@@ -39,6 +40,18 @@ def mirrored(robot: RobotModel, name: str, joints: Float[np.ndarray, "N J"]) -> 
             "or mirror_of and mirror_signs in its robot.toml"
         )
     return np.clip(joints * np.array(signs), robot.arms[name].lower, robot.arms[name].upper)
+
+
+def other_arm_options(robot: RobotModel, skeleton: Skeleton | None) -> tuple[str, ...]:
+    """Those of `OTHER_ARM` that this robot's other arms can do with this human; none where it has one arm."""
+    others = list(robot.arms)[1:]
+    if not others:
+        return ()
+    main = robot.spec.main
+    mirrors = all(main.name == robot.spec.arms[one].mirror_of or main.mirror_of == one for one in others)
+    seen = bool(np.isfinite(_left_wrist(skeleton, 1)).any())
+    needs = {"rest": (False, False), "mild": (True, False), "base-ik": (False, True), "mild-ik": (True, True)}
+    return tuple(name for name in OTHER_ARM if (mirrors or not needs[name][0]) and (seen or not needs[name][1]))
 
 
 def move_other_arms(
@@ -109,7 +122,11 @@ def _left_hand(
     skeleton: Skeleton | None, rate: float, T_world_human: Float[np.ndarray, "4 4"], n: int
 ) -> Float[np.ndarray, "N 3"]:
     """The human's left wrist [m], short gaps bridged as those of the right one are; NaN where it is not known."""
+    return in_frame(T_world_human, fill_gaps(_left_wrist(skeleton, n), max_gap(rate)))
+
+
+def _left_wrist(skeleton: Skeleton | None, n: int) -> Float[np.ndarray, "_ 3"]:
+    """As recorded, in the human's frame [m]; n rows of NaN where no skeleton has it."""
     if skeleton is None or LEFT_HAND not in skeleton.joint_names:
         return np.full((n, 3), np.nan)
-    wrist = skeleton.positions[:, skeleton.joint_names.index(LEFT_HAND)]
-    return in_frame(T_world_human, fill_gaps(wrist, max_gap(rate)))
+    return skeleton.positions[:, skeleton.joint_names.index(LEFT_HAND)]
