@@ -52,16 +52,16 @@ class Skeleton:
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
+    def rows(self, rows: slice) -> Skeleton:
+        """Some of its frames."""
+        return Skeleton(self.joint_names, self.bones, self.positions[rows])
+
     def joints(self, names: tuple[str, ...]) -> Float[np.ndarray, "T P 3"]:
         """The positions of some joints [m]; a name that is not there raises a `UserError`."""
         for name in names:
             if name not in self.joint_names:
                 raise UserError(f"the skeleton has no joint '{name}'; it has: {', '.join(self.joint_names)}")
         return self.positions[:, [self.joint_names.index(name) for name in names]]
-
-    def rows(self, rows: slice) -> Skeleton:
-        """Some of its frames."""
-        return Skeleton(self.joint_names, self.bones, self.positions[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from mild_viz.dashboard.tabs.widgets import sentence, set_content
 from mild_viz.errors import UserError
 from mild_viz.evaluation.controllers import ControllerFigures
 from mild_viz.rollout import Rollout
-from mild_viz.settings import ControlSettings, InferSettings, Settings
+from mild_viz.settings import CONTROLLERS_OF, ControlSettings, InferSettings, Settings
 from mild_viz.trial import CONTACT_ACTIONS
 
 
@@ -75,7 +75,11 @@ class Controls:
         infer, checkpoint, trial, robot = self._trial.read()
         contact_states = self._states.read(checkpoint, infer.variant, trial.action)
         control = self._robot.read(checkpoint, trial, robot, contact_states)
-        view = replace(self._view.read(), compared=self._compare.read(), compliance=self.compliance.read())
+        view = replace(
+            self._view.read(),
+            compared=self._compare.read(CONTROLLERS_OF[checkpoint.decodes]),
+            compliance=self.compliance.read(),
+        )
         return Choice(Settings(infer, control), view, checkpoint, trial, robot)
 
     def show(self, rollout: Rollout, choice: Choice, compared: Sequence[ControllerFigures] = ()) -> None:

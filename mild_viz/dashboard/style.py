@@ -35,7 +35,8 @@ TIMELINE_CSS = """
 .mv-timeline { display: none; }
 div:has(> div > .mv-timeline) {
   display: grid; grid-template-columns: auto auto auto minmax(0, 1fr); align-items: center; height: 100%;
-  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) 14px;
+  grid-template-rows: 28px 22px auto auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr)
+    var(--mv-force-row,) 14px;
   padding: 2px 0 0 0 !important; box-sizing: border-box;
 }
 div:has(> div > .mv-timeline) > div { padding-bottom: 0 !important; }
@@ -61,10 +62,8 @@ div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-InputWrapper-root {
 div:has(> div > .mv-timeline) > div:nth-child(6) .mantine-Slider-root { margin-inline: -3.7px; }
 div:has(> div > .mv-timeline) > div:nth-child(4) input { display: block; }
 .mv-lane { height: 100%; }
-[data-dock-root]:has(.mv-force) { --mv-height: clamp(330px, 43vh, 450px) !important; }
-div:has(> div > .mv-timeline):has(.mv-force) {
-  grid-template-rows: 28px 22px auto minmax(26px, 4fr) minmax(60px, 18fr) minmax(28px, 4fr) minmax(28px, 5fr) 14px;
-}
+[data-dock-root]:has(.mv-force) { --mv-height: clamp(338px, 44vh, 450px) !important; }
+div:has(> div > .mv-timeline):has(.mv-force) { --mv-force-row: minmax(28px, 5fr); }
 div:has(> div > .mv-timeline) > div:has(> .mv-force) { order: 1; }
 div:has(> div > .mv-timeline) > div:has(> .mv-axis) { order: 2; }
 """

@@ -86,13 +86,13 @@ def make_figure(inference: Inference) -> Figure:
 
 
 def partner_figure(inference: Inference) -> Figure | None:
-    """All poses of the second human of the recording, in that person's own frame; None without a whole skeleton.
+    """All poses of the giver of a handover, in that person's own frame; None without one, or without a whole skeleton.
 
     Without the legs: those of the handovers' givers were guessed by the tracker (knees straight to half a degree,
     feet up to half a metre above the other's floor), and the recording's own viewer leaves them out too.
     """
     skeleton = inference.partner_skeleton
-    if skeleton is None or not set(ARM) <= set(skeleton.joint_names):
+    if inference.action != "handover" or skeleton is None or not set(ARM) <= set(skeleton.joint_names):
         return None
     skeleton = without(skeleton, LEGS)
     arm = skeleton.positions[:, [skeleton.joint_names.index(name) for name in ARM]]

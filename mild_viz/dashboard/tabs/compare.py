@@ -30,9 +30,12 @@ class CompareFolder:
         for box in self._boxes.values():
             on_person(box, changed)
 
-    def read(self) -> tuple[str, ...]:
-        """The ticked controllers."""
-        return tuple(name for name, box in self._boxes.items() if box.value)
+    def read(self, valid: Sequence[str]) -> tuple[str, ...]:
+        """The ticked controllers, of those that go with the model."""
+        for name, box in self._boxes.items():
+            if box.disabled != (name not in valid):
+                box.disabled = name not in valid
+        return tuple(name for name, box in self._boxes.items() if box.value and name in valid)
 
     def show(self, figures: Sequence[ControllerFigures]) -> None:
         """Write the table of the controllers that were run; nothing where there is none."""

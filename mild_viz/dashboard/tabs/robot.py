@@ -28,8 +28,7 @@ class RobotTab:
     def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
-            hint="base-ik: always to the hand. mild: the decoded joints. mild-ik: decoded, adapted in contact states. "
-            "task-space: both arms to the decoded hands.",
+            hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: to decoded hands.",
         )  # fmt: skip
         self._other_arm = gui.add_dropdown(
             "Other arm", OTHER_ARM, initial_value=default.other_arm,
@@ -86,8 +85,7 @@ class RobotTab:
     def read(
         self, checkpoint: Checkpoint, trial: Trial, robot: RobotModel, contact_states: frozenset[int]
     ) -> ControlSettings:
-        """The chosen settings, of what this robot and model can do. The placement is the trial's own until a person
-        moves it."""
+        """The chosen settings, of what this robot and model can do. The placement is the trial's own until moved."""
         controllers = CONTROLLERS_OF[checkpoint.decodes]
         chosen = option(self._controller)
         offer(self._controller, controllers, chosen if chosen in controllers else controllers[-1])

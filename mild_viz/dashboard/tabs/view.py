@@ -58,8 +58,7 @@ class ViewTab:
         }
         self._giver = gui.add_checkbox(
             "Show giver", default.show_giver, visible=False,
-            hint="Draw the recorded giver, grey (legs schematic), in the robot's place. The object is in the robot's "
-            "hand until the recorded transfer, then as recorded; without the robot it is as recorded all along.",
+            hint="Draw the recorded giver, grey (legs schematic). Without the robot, the object too is as recorded.",
         )  # fmt: skip
         self._axis_names = ["z0", "z1", "z2"]
         """What the axes were at the last reading."""
