@@ -27,7 +27,8 @@ def evaluate(
     Args:
         checkpoint: Folders of trained models, one or several; what several hold is summed up by best and median.
             Default: the shipped model of the dataset. Example: --checkpoint runs/a runs/b
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
+        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, handover-hands, bimanual, buetepage.
+            Example: --dataset nuisi
         compare: Predictors to compare, each with each. Default: every variant with knn-time, over all actions.
             A variant that several checkpoints hold stands for the average of their errors; VARIANT@CHECKPOINT is one
             of them. Example: --compare v3.1 v1 ridge
@@ -57,7 +58,8 @@ def report(
     Example: mild-viz report --dataset nuisi --out nuisi.html
 
     Args:
-        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, buetepage. Example: --dataset nuisi
+        dataset: Recordings to evaluate on: demo, nuisi, yumi, handover, handover-hands, bimanual, buetepage.
+            Example: --dataset nuisi
         checkpoint: Folders of trained models, one or several. Default: the shipped model of the dataset.
             Example: --checkpoint runs/a runs/b
         out: The page. Default: DATASET-report.html in this folder. Example: --out nuisi.html

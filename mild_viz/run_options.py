@@ -146,7 +146,7 @@ class RunOptions(ModelOptions):
     """What to run the pipeline on: model, trial and controller.
 
     Attributes:
-        dataset: Recordings: demo, nuisi, yumi, handover, handover-hands, buetepage. Example: --dataset nuisi
+        dataset: Recordings: demo, nuisi, yumi, handover, handover-hands, bimanual, buetepage. Example: --dataset nuisi
         split: Part of the dataset. Example: --split train
         trial: Trial of the split, from 0. Example: --trial 3
     """

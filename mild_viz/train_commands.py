@@ -44,7 +44,8 @@ def train(
     Args:
         out: Folder to write the model to; the state of an unfinished run lies beside it. Default: runs/DATASET-STAGE.
             Example: --out runs/mine
-        dataset: Recordings to train on: demo, nuisi, yumi, handover, buetepage. The robot is the dataset's: a Pepper,
+        dataset: Recordings to train on: demo, nuisi, yumi, handover, handover-hands, bimanual, buetepage. The robot
+            is the dataset's: a Pepper,
             for yumi the YuMi that was recorded, for handover a Panda. Example: --dataset nuisi
         stage: How far to go: hhi (human-human) or hri (human-robot). Example: --stage hhi
         variant: Variants to train, one or several. Example: --variant v3.1 v3.2

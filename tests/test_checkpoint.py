@@ -235,6 +235,8 @@ def test_values_that_are_not_finite_are_named(folder: Path) -> None:
         ),
         ({"placement": 5}, "placement is 5, expected an object"),
         ({"meeting": {"partner": [1, 0, 0]}}, "meeting: missing human, source"),
+        ({"points": ["right_wrist"]}, r"points is \['right_wrist'\], expected .* or right_wrist, left_wrist"),
+        ({"workspace": []}, r"workspace is \[\], expected a box for each of right_wrist, left_wrist"),
         (
             {"meeting": {"partner": [1, 0], "human": [1, 0, 0], "source": ""}},
             r"meeting\.partner is .*, expected three numbers",

@@ -11,7 +11,7 @@ from mild_viz.errors import UserError
 from mild_viz.trial import Dataset
 
 DATASETS = tuple(SOURCES)
-"""demo, nuisi, yumi, handover, buetepage."""
+"""demo, nuisi, yumi, handover, handover-hands, bimanual, buetepage."""
 
 
 def data_root() -> Path:
@@ -31,9 +31,9 @@ def check_name(name: str) -> None:
 
 
 def missing_files(name: str, root: Path) -> list[Path]:
-    """Those of the files that a dataset needs which are not below `root`."""
+    """Those of the files (or folders) that a dataset needs which are not below `root`."""
     needed = [file.path for file in SOURCES[name].files if not file.optional]
-    return [path for path in needed if not (root / path).is_file()]
+    return [path for path in needed if not (root / path).exists()]
 
 
 def load_dataset(name: str, root: Path | None = None) -> Dataset:
@@ -71,6 +71,10 @@ def _load(name: str, root: Path) -> Dataset:
         from mild_viz.data.buetepage import read_buetepage
 
         return read_buetepage(root)
+    if name == "bimanual":
+        from mild_viz.data.bimanual import read_bimanual
+
+        return read_bimanual(root)
     if name == "handover-hands":
         from mild_viz.data.handover import read_handover_hands
 

@@ -75,6 +75,14 @@ SOURCES: dict[str, Source] = {
     ),
     "handover": HANDOVERS,
     "handover-hands": HANDOVERS,
+    "bimanual": Source(
+        (DataFile(Path("bimanual/Bimanual Handovers Dataset")),),
+        by_hand=(
+            "It is the record 7767535 of Zenodo, https://zenodo.org/records/7767535, whose files and checksums are not "
+            "known here, and mild_viz keeps nothing that it cannot check. Download and unpack it yourself, and place "
+            "its folder, with P07_P08 and so on inside, at"
+        ),
+    ),
     "buetepage": Source(
         (DataFile(Path("buetepage/traj_data.npz")),),
         by_hand=(

@@ -27,6 +27,7 @@ DATASET_ROBOTS = {
     "yumi": "yumi",
     "handover": "panda",
     "handover-hands": "kobo",
+    "bimanual": "kobo",
 }
 """The robot that a dataset's models are trained for: the recorded one, else the one that the partner's arm suits."""
 

@@ -50,10 +50,10 @@ class Box:
 
     def __post_init__(self) -> None:
         sides = np.subtract(self.upper, self.lower)
-        if not ((sides > 0.0) & (np.abs(self.lower) < MAX_PLACEMENT) & (np.abs(self.upper) < MAX_PLACEMENT)).all():
+        if not ((sides >= 0.0) & (np.abs(self.lower) < MAX_PLACEMENT) & (np.abs(self.upper) < MAX_PLACEMENT)).all():
             raise UserError(
-                f"workspace: a box from {self.lower} to {self.upper}; valid: lower below upper, and numbers below "
-                f"{MAX_PLACEMENT}"
+                f"workspace: a box from {self.lower} to {self.upper}; valid: no lower above its upper, and numbers "
+                f"below {MAX_PLACEMENT}"
             )
 
 

@@ -28,7 +28,11 @@ class RobotTab:
     def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
+<<<<<<< HEAD
             hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: both decoded hands.",
+=======
+            hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: to decoded hands.",
+>>>>>>> w4/hands
         )  # fmt: skip
         self._other_arm = gui.add_dropdown(
             "Other arm", OTHER_ARM, initial_value=default.other_arm,
@@ -87,10 +91,10 @@ class RobotTab:
     ) -> ControlSettings:
         """The chosen settings, of what this robot and model can do. The placement is the trial's own until moved."""
         controllers = CONTROLLERS_OF[checkpoint.decodes]
-        if tuple(self._controller.options) != controllers:
-            self._controller.options = controllers
-            self._controller.value = controllers[-1]
-        others = other_arm_options(robot, trial.human_skeleton)
+        chosen = option(self._controller)
+        offer(self._controller, controllers, chosen if chosen in controllers else controllers[-1])
+        # A model of two hands moves both arms itself.
+        others = ("rest",) if checkpoint.decodes == "hands" else other_arm_options(robot, trial.human_skeleton)
         self._other_arm.disabled = len(others) < 2
         offer(self._other_arm, others or ("rest",))
         weights = {}
