@@ -28,11 +28,7 @@ class RobotTab:
     def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
-<<<<<<< HEAD
             hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: both decoded hands.",
-=======
-            hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: to decoded hands.",
->>>>>>> w4/hands
         )  # fmt: skip
         self._other_arm = gui.add_dropdown(
             "Other arm", OTHER_ARM, initial_value=default.other_arm,
