@@ -289,7 +289,7 @@ def bad_trial(few: list[Trial], change: str) -> Trial:
     [
         ("short", r"trial demo/train/1 has 9 frames, which is less than two windows; expected at least 10"),
         ("nan", r"trial demo/train/1: robot_joints is not a number at frame 7; expected finite values"),
-        ("inf", r"trial demo/train/1: human_arm is not a number at frame 3 and 1 more"),
+        ("inf", r"trial demo/train/1: human_points is not a number at frame 3 and 1 more"),
     ],
 )
 def test_a_trial_that_cannot_be_learnt_from_is_named(
