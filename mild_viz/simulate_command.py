@@ -73,16 +73,16 @@ def simulate(
     if not numbers:
         raise UserError(f"{dataset.name}/{run.split} has no {action}; its actions: {', '.join(dataset.actions)}")
     found: list[tuple[int, Comparison]] = []
-    variant = run.variant
+    variant = controller = ""
     for number in numbers:
         rollout, robot = replace(run, trial=number).run()
-        variant = rollout.inference.variant
+        variant, controller = rollout.inference.variant, rollout.controller
         for scenario in SCENARIOS:
             comparison = compare(robot, rollout, scenario, impedance, hand)
             found.append((number, comparison))
             if out is not None:
                 comparison.save(out / f"{run.split}-{number}-{scenario}.npz")
-    _print(f"{run.dataset}/{run.split}, {variant}, {run.controller}: full stiffness → schedule", found)
+    _print(f"{run.dataset}/{run.split}, {variant}, {controller}: full stiffness → schedule", found)
     if out is not None:
         print(f"{out}: {len(found)} motions")
     if csv is not None:

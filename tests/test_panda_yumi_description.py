@@ -118,6 +118,6 @@ def test_every_dataset_has_a_robot() -> None:
     from mild_viz.data.load import DATASETS
     from mild_viz.errors import UserError
 
-    assert {robot_of(name) for name in DATASETS} == {"pepper", "yumi", "panda"}
+    assert {robot_of(name) for name in DATASETS} == {"pepper", "yumi", "panda", "kobo"}
     with pytest.raises(UserError, match="valid: demo"):
         robot_of("gestures")
