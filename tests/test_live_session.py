@@ -58,7 +58,7 @@ def run(model: StreamModel, path: Path, trials: tuple[int, ...] = (HANDSHAKE,)) 
     """Record a session of several trials in a row, each followed by silence."""
     frames: list = []
     for trial in trials:
-        frames += [*stream(load_dataset("demo").test[trial], whole=True), *[None] * 3]
+        frames += [*stream(load_dataset("demo").test[trial], whole=True), *[None] * 25]  # time to be back at rest
     ticks: list[Tick] = []
     source, output = ListInput(frames, pause=0.004), ListOutput()
     header = session_header(load_checkpoint(default_checkpoint("demo")), model, "pepper", CONFIG, ("list", "list"))
