@@ -209,6 +209,34 @@ def test_switching_the_dataset_brings_its_model_actions_and_trials(
     assert session.wait_idle() and session.choice.trial.dataset == "demo"
 
 
+def test_compared_controllers_run_once_and_the_one_that_is_shown_not_again(dashboard: Dashboard) -> None:
+    compare, session, view = dashboard.controls._compare, dashboard.session, dashboard.controls._view
+
+    def settle() -> None:
+        session.mark_dirty()
+        assert session.wait_idle() and session.error is None, session.error
+
+    for box in compare._boxes.values():
+        box.value = True
+    settle()
+    of, ran = dashboard._compared
+    assert of is session.rollout and set(ran) == {"base-ik", "mild", "mild-ik"}
+    assert session.rollout is not None and ran[session.rollout.controller] is session.rollout
+    assert all(name in compare._table.content for name in ran) and compare._table.visible
+    before = dict(ran)
+    view._sigma.value = 1.0
+    settle()
+    assert all(dashboard._compared[1][name] is one for name, one in before.items()), "a view runs no controller"
+    dashboard.controls._robot._smoothing.value = 0.5
+    settle()
+    assert dashboard._compared[1]["base-ik"] is not before["base-ik"], "another setting runs them all"
+    for box in compare._boxes.values():
+        box.value = False
+    view._sigma.value, dashboard.controls._robot._smoothing.value = 2.0, 0.8
+    settle()
+    assert not compare._table.visible
+
+
 def test_a_robot_brings_what_moves_it_and_a_dataset_its_robot(
     dashboard: Dashboard, dataset: Callable[[str], Any]
 ) -> None:

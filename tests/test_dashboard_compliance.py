@@ -130,7 +130,7 @@ def test_the_simulated_arm_and_the_force_are_drawn(robot: RobotModel, rollout: R
         poses = robot.link_poses(motion.joints, "handshake")[strongest]
         commands = robot.link_poses(held.joints_commanded, "handshake")[strongest]
         wrist = robot.link_names.index("r_wrist")
-        assert np.allclose(handle(server, "/compliance/r_wrist").position, poses[wrist, 4:])
+        assert np.allclose(handle(server, "/compliance/arm/r_wrist").position, poses[wrist, 4:])
         assert np.allclose(handle(server, "/robot/solid/r_wrist").position, commands[wrist, 4:])
         foot, point = handle(server, "/compliance/force").points[0]
         assert np.allclose(point - foot, METRES_PER_NEWTON * motion.hand_force[strongest], atol=1e-6)

@@ -26,7 +26,7 @@ from mild_viz.dashboard.scene.latent import (
     towards_viewer,
 )
 from mild_viz.dashboard.scene.layout import CAMERAS, FIELD_OF_VIEW, PLOT_SIZE, Camera, picture_axes
-from mild_viz.dashboard.scene.palette import DARK, LIGHT, linear, state_color
+from mild_viz.dashboard.scene.palette import CONTROLLER_COLORS, DARK, LIGHT, linear, state_color
 from mild_viz.dashboard.scene.projection import LARGEST_RADIUS, magnified, make_projection, nice_step
 from mild_viz.dashboard.scene.scene import Scene
 from mild_viz.dashboard.scene.shapes import ball, limb, limb_poses, quaternion_from_matrix, rotate
@@ -125,6 +125,35 @@ def test_the_ghost_shows_the_decoded_arm_only_where_it_differs(
     scene.show(rollout, ViewSettings(ghost=False))
     scene.set_frame(apart)
     assert not node(server, "/robot/ghost").visible and node(server, "/robot/caption").text == "mild-ik command"
+
+
+def test_compared_controllers_are_ghosts_in_their_colours(
+    server: viser.ViserServer, scene: Scene, rollout: Rollout
+) -> None:
+    other = replace(rollout, controller="mild", link_poses=rollout.link_poses_decoded)
+    scene.show(rollout, ViewSettings(compared=("mild", "mild-ik")), (other, rollout))
+    scene.set_frame(50)
+    assert node(server, "/compared/mild").visible
+    assert not node(server, "/compared/mild-ik").visible, "the one that is shown solid needs no ghost"
+    i = rollout.link_names.index("RForeArm")
+    handle = node(server, "/compared/mild/RForeArm")
+    np.testing.assert_allclose(handle.position, rollout.link_poses_decoded[50, i, 4:], atol=2e-5)
+    assert handle.color == CONTROLLER_COLORS["mild"] and not node(server, "/robot/ghost").visible
+    scene.show(rollout, ViewSettings())
+    assert not node(server, "/compared/mild").visible
+
+
+def test_the_reach_volume_is_drawn_when_it_is_asked_for(
+    server: viser.ViserServer, scene: Scene, rollout: Rollout, robot: RobotModel
+) -> None:
+    scene.show(rollout, ViewSettings())
+    assert "/reach_volume" not in node_names(server), "it takes time to compute"
+    scene.show(rollout, ViewSettings(show_reach=True))
+    surface = node(server, "/reach_volume")
+    far = np.linalg.norm(surface.vertices - robot.chain.shoulder, axis=1).max()
+    assert surface.visible and far == pytest.approx(robot.chain.reach, abs=5e-3)
+    scene.show(rollout, ViewSettings())
+    assert not node(server, "/reach_volume").visible
 
 
 def test_recorded_joints_are_drawn_where_they_were_seen_and_gaps_are_hidden(

@@ -29,7 +29,7 @@ from mild_viz.evaluation.controllers import controller_figures, run_controllers
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
-from mild_viz.settings import CONTROLLERS_OF, ControlSettings, InferSettings, choose
+from mild_viz.settings import ControlSettings, InferSettings, choose
 from mild_viz.trial import Dataset
 
 LABEL = "mild_viz"
@@ -53,6 +53,8 @@ class Dashboard:
             self._write_html, self._write_csv, ControlSettings() if recorded is None else recorded.settings,
         )  # fmt: skip
         self.timeline = Timeline(self.server, self.player)
+        self._compared: tuple[Rollout | None, dict[str, Rollout]] = None, {}
+        """What was last compared, and the rollout that it belongs to."""
         of = pipeline if recorded is None else recorded
         stages = Pipeline(of.infer, of.control)
         self.compliance = ComplianceStage(self.scene, self.controls.compliance, self.timeline)
@@ -87,10 +89,19 @@ class Dashboard:
             threading.Thread(target=self.controls.offer_datasets, name="mild_viz datasets", daemon=True).start()
 
     def _compare(self, rollout: Rollout, choice: Choice) -> tuple[Rollout, ...]:
-        """The rollouts of the compared controllers; a few milliseconds each, in the session's worker."""
-        known, settings = CONTROLLERS_OF[choice.checkpoint.decodes], choice.settings.control
-        compared = tuple(name for name in choice.view.compared if name in known)
-        return run_controllers(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings, compared)
+        """The rollouts of the compared controllers, the one that is shown among them, in the session's worker.
+
+        A few milliseconds each; a change of view alone runs none again.
+        """
+        of, ran = self._compared
+        if of is not rollout:
+            ran = {rollout.controller: rollout}
+        missing = [name for name in choice.view.compared if name not in ran]
+        settings = choice.settings.control
+        more = run_controllers(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings, missing)
+        ran |= {one.controller: one for one in more}
+        self._compared = rollout, ran
+        return tuple(ran[name] for name in choice.view.compared)
 
     def _tick(self, frame: int, playing: bool) -> None:
         self.timeline.tick(frame, playing)

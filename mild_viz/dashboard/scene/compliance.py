@@ -9,9 +9,9 @@ import trimesh
 import viser
 from jaxtyping import Float
 
+from mild_viz.dashboard.scene.ghost import GhostArm, moving_links
 from mild_viz.dashboard.scene.labels import NOTE, add_label
 from mild_viz.dashboard.scene.palette import FORCE, SIMULATED, linear
-from mild_viz.dashboard.scene.robot import moving_links
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 from mild_viz.simulation.compare import Comparison
@@ -77,43 +77,31 @@ class ComplianceView:
     def __init__(
         self, server: viser.ViserServer, visuals: dict[str, trimesh.Trimesh], link_names: tuple[str, ...]
     ) -> None:
-        self._server, self._visuals, self._link_names = server, visuals, link_names
         self._frame = server.scene.add_frame(ROOT, show_axes=False, visible=False)
+        self._arm = GhostArm(server, f"{ROOT}/arm", visuals, link_names, OPACITY)
         self._arrow = server.scene.add_arrows(
             f"{ROOT}/force", np.zeros((1, 2, 3)), linear(np.array(FORCE, dtype=np.uint8)), shaft_radius=0.008,
             head_radius=0.018, head_length=0.03,
         )  # fmt: skip
         self._text = add_label(server, f"{ROOT}/text", "", NOTE, "top-center")
-        self._links: dict[int, viser.MeshHandle] = {}
         self._frames: ComplianceFrames | None = None
 
     def clear(self) -> None:
         """Draw nothing: what was simulated no longer belongs to what is shown."""
         self._frames = None
-        self._frame.visible = False
+        self._frame.visible = self._arm.visible = False
 
     def show(self, frames: ComplianceFrames, visible: bool) -> None:
         """Take over a simulation."""
-        self._frames, self._frame.visible = frames, visible
-        moving = moving_links(frames.poses)
-        for i in moving:
-            link = self._link_names[i]
-            if i not in self._links and link in self._visuals:
-                mesh = self._visuals[link]
-                self._links[i] = self._server.scene.add_mesh_simple(
-                    f"{ROOT}/{link}", mesh.vertices, mesh.faces, color=SIMULATED, opacity=OPACITY,
-                    cast_shadow=False, receive_shadow=False,
-                )  # fmt: skip
-        for i, handle in self._links.items():
-            handle.visible = i in moving
+        self._frames, self._frame.visible, self._arm.visible = frames, visible, visible
+        self._arm.show(frames.poses, moving_links(frames.poses), SIMULATED)
 
     def set_frame(self, n: int) -> None:
         """Show frame n."""
         frames = self._frames
-        if frames is None:
+        if frames is None or not self._frame.visible:
             return
-        for i, handle in self._links.items():
-            handle.wxyz, handle.position = frames.poses[n, i, :4], frames.poses[n, i, 4:]
+        self._arm.set_frame(n)
         hand, force = frames.hand[n], frames.force[n]
         pulls = bool(np.linalg.norm(force) >= SHORTEST)
         self._arrow.visible, self._text.visible = pulls, bool(frames.texts[n])
@@ -126,5 +114,5 @@ class ComplianceView:
 
     def remove(self) -> None:
         """Take everything out of the scene."""
-        for handle in (*self._links.values(), self._arrow, self._text, self._frame):
+        for handle in (self._arm, self._arrow, self._text, self._frame):
             handle.remove()

@@ -13,9 +13,9 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from mild_viz.dashboard.scene.ghost import moving_links
 from mild_viz.dashboard.scene.labels import NOTE, add_label
 from mild_viz.dashboard.scene.palette import Palette
-from mild_viz.dashboard.scene.robot import moving_links
 from mild_viz.dashboard.scene.shapes import Mesh, loft
 from mild_viz.rollout import Rollout
 

@@ -29,8 +29,9 @@ class ReachView:
             f"{ROOT}/contact", radius=0.085, opacity=0.3, cast_shadow=False, receive_shadow=False
         )
         self._target = server.scene.add_icosphere(
-            f"{ROOT}/target", radius=0.07, subdivisions=1, wireframe=True, cast_shadow=False, receive_shadow=False
-        )
+            f"{ROOT}/target", radius=0.06, subdivisions=1, wireframe=True, opacity=0.4,
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
         self._text = add_label(server, f"{ROOT}/distance", "", NOTE, "top-center")
         self._rollout: Rollout | None = None
 
@@ -60,10 +61,10 @@ class ReachView:
         known, contact = bool(self._known[n]), bool(self._rollout.contact[n])
         self._line.visible = self._text.visible = known
         # where the controller believes the hand to be: while tracking is lost, where it was seen last
-        self._target.visible = bool(self._aimed[n])
+        self._contact.visible = known and contact and bool(self._rollout.hand_distance[n] < TOUCH)
+        self._target.visible = bool(self._aimed[n]) and not self._contact.visible  # one mark at a time
         self._target.position = self._ends[n, 1]
         self._target.color = self._target_colors[bool(self._unreachable[n])]
-        self._contact.visible = known and contact and bool(self._rollout.hand_distance[n] < TOUCH)
         if not known:
             return
         self._line.points = self._ends[n : n + 1]

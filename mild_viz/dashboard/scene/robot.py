@@ -9,6 +9,7 @@ import trimesh
 import viser
 from jaxtyping import Bool, Float
 
+from mild_viz.dashboard.scene.ghost import GhostArm, moving_links
 from mild_viz.dashboard.scene.labels import add_title
 from mild_viz.dashboard.scene.palette import Palette
 from mild_viz.dashboard.scene.shapes import rotate
@@ -41,11 +42,6 @@ def robot_frames(rollout: Rollout) -> RobotFrames:
     return RobotFrames(rollout.link_poses, rollout.link_poses_decoded, solid, ghost, gap > GHOST_FROM)
 
 
-def moving_links(poses: Float[np.ndarray, "N L 7"]) -> tuple[int, ...]:
-    """Indices of the links that do not stand still."""
-    return tuple(np.flatnonzero((np.ptp(poses, axis=0) > 1e-6).any(1)).tolist())
-
-
 class RobotView:
     """One node per link, posed from the rollout."""
 
@@ -53,7 +49,7 @@ class RobotView:
         self, server: viser.ViserServer, visuals: dict[str, trimesh.Trimesh], link_names: tuple[str, ...], title: str
     ) -> None:
         self._frame = server.scene.add_frame(ROOT, show_axes=False)
-        self._ghost_frame = server.scene.add_frame(f"{ROOT}/ghost", show_axes=False)
+        self._ghost = GhostArm(server, f"{ROOT}/ghost", visuals, link_names, GHOST_OPACITY)
         self._title, self._caption = add_title(server, ROOT, f"Robot: {title}")
         self._visuals = {i: visuals[link] for i, link in enumerate(link_names) if link in visuals}
         self._solid = {
@@ -62,15 +58,12 @@ class RobotView:
             )
             for i, mesh in self._visuals.items()
         }
-        self._ghost: dict[int, viser.MeshHandle] = {}
-        self._link_names = link_names
-        self._server = server
         self._frames: RobotFrames | None = None
         self._bounds: Float[np.ndarray, "2 3"] | None = None
 
     def remove(self) -> None:
         """Take everything out of the scene."""
-        self._ghost_frame.remove()
+        self._ghost.remove()
         self._frame.remove()
 
     def bounds(self, rollout: Rollout) -> Float[np.ndarray, "2 3"]:
@@ -96,18 +89,10 @@ class RobotView:
         self._frames = frames
         self._frame.visible = visible
         self._show_ghost = ghost and bool(frames.ghost_visible.any())
-        for i in set(frames.ghost_moving) & set(self._visuals) - set(self._ghost):
-            mesh = self._visuals[i]
-            self._ghost[i] = self._server.scene.add_mesh_simple(
-                f"{ROOT}/ghost/{self._link_names[i]}", mesh.vertices, mesh.faces, opacity=GHOST_OPACITY,
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
-        for i, handle in self._ghost.items():
-            handle.color = colors.prediction
-            handle.visible = i in frames.ghost_moving
+        self._ghost.show(frames.ghost_poses, frames.ghost_moving, colors.prediction)
         # Those that move follow with the frame.
         still = tuple(i for i in range(frames.poses.shape[1]) if i not in frames.moving)
-        self._pose(self._solid, still, frames.poses[0])
+        self._pose(still, frames.poses[0])
         self._title.position = self._caption.position = title
         self._caption.text = f"{controller} command" + (" · pale: decoded, before IK" if self._show_ghost else "")
 
@@ -123,17 +108,12 @@ class RobotView:
         frames = self._frames
         if frames is None:
             return
-        self._pose(self._solid, frames.moving, frames.poses[n])
-        ghost = self._show_ghost and bool(frames.ghost_visible[n])
-        self._ghost_frame.visible = ghost
-        if ghost:
-            self._pose(self._ghost, frames.ghost_moving, frames.ghost_poses[n])
+        self._pose(frames.moving, frames.poses[n])
+        self._ghost.visible = self._show_ghost and bool(frames.ghost_visible[n])
+        self._ghost.set_frame(n)
 
-    def _pose(
-        self, handles: dict[int, viser.GlbHandle] | dict[int, viser.MeshHandle], links: tuple[int, ...],
-        poses: Float[np.ndarray, "L 7"],
-    ) -> None:  # fmt: skip
+    def _pose(self, links: tuple[int, ...], poses: Float[np.ndarray, "L 7"]) -> None:
         for i in links:
-            handle = handles.get(i)
+            handle = self._solid.get(i)
             if handle is not None:
                 handle.wxyz, handle.position = poses[i, :4], poses[i, 4:]
