@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from mild_viz import streaming
-from mild_viz.checkpoint import Checkpoint, load_checkpoint
-from mild_viz.data.load import load_dataset
+from mild_viz.checkpoint import Checkpoint
 from mild_viz.errors import UserError
-from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer
 from mild_viz.robot.control import rules
 from mild_viz.robot.control.other_arm import mirrored, other_arm_options
@@ -24,20 +22,7 @@ from mild_viz.rollout import OTHER_SAVED, Rollout
 from mild_viz.settings import OTHER_ARM, ControlSettings
 from mild_viz.trial import Trial
 
-
-@pytest.fixture(scope="module")
-def model() -> Checkpoint:
-    return load_checkpoint(default_checkpoint("demo"))
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot("pepper")
-
-
-@pytest.fixture(scope="module")
-def handshake() -> Trial:
-    return next(trial for trial in load_dataset("demo").test if trial.action == "handshake")
+pytest_plugins = ["demo_fixtures"]
 
 
 def run(model: Checkpoint, robot: RobotModel, trial: Trial, other_arm: str, **settings: Any) -> Rollout:

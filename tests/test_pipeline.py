@@ -9,39 +9,21 @@ import numpy as np
 import pytest
 
 from mild_viz import streaming
-from mild_viz.checkpoint import Checkpoint, load_checkpoint
+from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.load import load_dataset
 from mild_viz.data.windows import human_windows, pair_windows
 from mild_viz.errors import UserError
 from mild_viz.latent.gmr import condition
 from mild_viz.latent.hmm import forward_filter, log_emission
 from mild_viz.pairs import robot_truth
-from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer, state_visits
 from mild_viz.robot.control import rules
-from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import SAVED, Rollout
 from mild_viz.settings import CONTROLLERS_OF, PAPER_VARIANTS, VARIANTS, ControlSettings, Placement
 from mild_viz.trial import Trial
 
-HANDSHAKE = 4
-
-
-@pytest.fixture(scope="module")
-def model() -> Checkpoint:
-    return load_checkpoint(default_checkpoint("demo"))
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot("pepper")
-
-
-@pytest.fixture(scope="module")
-def handshake() -> Trial:
-    trial = load_dataset("demo").test[HANDSHAKE]
-    assert trial.action == "handshake"
-    return trial
+pytest_plugins = ["demo_fixtures"]
 
 
 def run(model: Checkpoint, robot: RobotModel, trial: Trial, variant: str = "v3.1", **settings: object) -> Rollout:

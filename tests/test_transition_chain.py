@@ -19,29 +19,15 @@ from mild_viz.latent.hmm import forward_filter, log_emission
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import Windows, stack_windows
-from mild_viz.paths import default_checkpoint
 from mild_viz.pipeline import control, infer
-from mild_viz.robot.model import RobotModel, load_robot
+from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
 from mild_viz.settings import ControlSettings
 from mild_viz.training.transition import learn_transition_states
 from mild_viz.trial import Trial
 from tests.models import random_checkpoint
 
-
-@pytest.fixture(scope="module")
-def model() -> Checkpoint:
-    return load_checkpoint(default_checkpoint("demo"))
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot("pepper")
-
-
-@pytest.fixture(scope="module")
-def handshake() -> Trial:
-    return next(trial for trial in load_dataset("demo").test if trial.action == "handshake")
+pytest_plugins = ["demo_fixtures"]
 
 
 @pytest.fixture(scope="module")

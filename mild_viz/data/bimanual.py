@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mild_viz.data.checks import file_checksum
-from mild_viz.data.skeletons import ARM_JOINTS, bones_along, first_person_frame, joint_indices, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, bones_along, joint_indices, own_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
 from mild_viz.robot.contact import arm_length
@@ -49,9 +49,6 @@ BODY = bones_along(
     "neck left_clavicle left_shoulder left_elbow left_wrist",
     "neck right_clavicle right_shoulder right_elbow right_wrist",
 )
-REFERENCE_JOINTS = ("left_shoulder", "right_shoulder", "pelvis", "neck")
-"""What sets a person's own frame, as of the other handovers."""
-
 PHASE_OF = {"": "rest", "reach": "reach", "transfer": "contact", "retreat": "return"}
 
 ARM_LENGTHS = (0.3, 1.0)
@@ -158,5 +155,4 @@ def _own_frame(path: Path, person: str, body: Float[np.ndarray, "T 13 3"]) -> tu
             f"{path}: the right arm of {person} is {length:.3g} long; expected metres, {ARM_LENGTHS[0]} to "
             f"{ARM_LENGTHS[1]} of them, and an arm that is tracked"
         )
-    T_world_person = first_person_frame(body, joint_indices(JOINTS, REFERENCE_JOINTS))
-    return T_world_person, Skeleton(JOINTS, BODY, to_frame(T_world_person, body))
+    return own_frame(body, JOINTS, BODY)

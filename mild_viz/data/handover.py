@@ -21,17 +21,15 @@ from jaxtyping import Float
 
 from mild_viz.data.checks import file_checksum
 from mild_viz.data.npz import load_npz
-from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, first_person_frame, joint_indices, to_frame
+from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, joint_indices, own_frame, to_frame
 from mild_viz.data.windows import MIN_FRAMES
 from mild_viz.errors import UserError
-from mild_viz.trial import HAND_POINTS, Dataset, ObjectTrack, Skeleton, Trial
+from mild_viz.trial import HAND_POINTS, Dataset, ObjectTrack, Trial
 
 FILES = {split: Path(f"handover/{split}.npz") for split in ("train", "test")}
 ARRAYS = ("receiver", "giver", "offsets", "rate_hz")
 OBJECT_ARRAYS = ("object_position", "object_quaternion")
 """Read where they are there: (N, 3) [m] and (N, 4), wxyz."""
-REFERENCE_JOINTS = ("left_shoulder", "right_shoulder", "pelvis", "neck")
-"""What sets a person's own frame: ZED's neck stands where Nuitrack has the collar, between the shoulders."""
 
 MIN_UPRIGHT = 0.8
 """Least mean share of the direction from pelvis to head that must lie along one axis for it to be 'up'."""
@@ -73,8 +71,8 @@ def read_file(path: Path, split: str) -> list[Trial]:
     trials = []
     for index, (first, last) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
         try:
-            T_world_human, human = _own_frame(receiver[first:last])
-            T_world_partner, partner = _own_frame(giver[first:last])
+            T_world_human, human = own_frame(receiver[first:last], ZED_JOINTS, ZED_BONES)
+            T_world_partner, partner = own_frame(giver[first:last], ZED_JOINTS, ZED_BONES)
         except UserError as error:
             raise UserError(f"{path}: {split} trial {index}: {error}") from error
         arm = joint_indices(ZED_JOINTS, ARM_JOINTS)
@@ -183,9 +181,3 @@ def _turn_upright(path: Path, bodies: Float[np.ndarray, "N 34 3"]) -> Float[np.n
         )
     turn = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3, axis]]
     return turn if upward[axis] > 0 else np.diag([-1.0, 1.0, -1.0]) @ turn
-
-
-def _own_frame(body: Float[np.ndarray, "T 34 3"]) -> tuple[Float[np.ndarray, "4 4"], Skeleton]:
-    """T_world_person from the first frame in which the person is tracked, and the body in it."""
-    T_world_person = first_person_frame(body, joint_indices(ZED_JOINTS, REFERENCE_JOINTS))
-    return T_world_person, Skeleton(ZED_JOINTS, ZED_BONES, to_frame(T_world_person, body))

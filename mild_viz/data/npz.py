@@ -130,7 +130,7 @@ def load_npz(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndarray
         raise
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, EOFError, ValueError, RuntimeError) as error:
         raise UserError(f"{path} is truncated or not an .npz archive: {error}") from error
     except Exception as error:  # zlib.error has no common base with the others
         raise UserError(f"{path} is damaged: {error}") from error

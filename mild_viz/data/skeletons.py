@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.errors import UserError
-from mild_viz.trial import ARM_POINTS
+from mild_viz.trial import ARM_POINTS, Skeleton
 
 ARM_JOINTS = ARM_POINTS
 """The joints of `Trial.human_arm`, in its order, which every body model here has."""
@@ -100,6 +100,18 @@ def first_person_frame(body: Float[np.ndarray, "T K 3"], reference: list[int]) -
     joints = body[:, reference]
     tracked = np.isfinite(joints).all(axis=(1, 2))
     return person_frame(*joints[tracked.argmax()])
+
+
+REFERENCE_JOINTS = ("left_shoulder", "right_shoulder", "pelvis", "neck")
+"""What sets a person's own frame in a ZED body: its neck is where Nuitrack has the collar, between the shoulders."""
+
+
+def own_frame(
+    body: Float[np.ndarray, "T K 3"], joints: tuple[str, ...], bones: tuple[tuple[int, int], ...]
+) -> tuple[Float[np.ndarray, "4 4"], Skeleton]:
+    """T_world_person from the first frame in which a body [m] is tracked (`REFERENCE_JOINTS`), and the body in it."""
+    T_world_person = first_person_frame(body, joint_indices(joints, REFERENCE_JOINTS))
+    return T_world_person, Skeleton(joints, bones, to_frame(T_world_person, body))
 
 
 def to_frame(T_world_frame: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:

@@ -6,13 +6,21 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.data.demo_body import DEMO_BONES, DEMO_JOINTS
-from mild_viz.data.skeletons import ARM_JOINTS, ZED_BONES, ZED_JOINTS, joint_indices, person_frame, to_frame
+from mild_viz.data.skeletons import (
+    ARM_JOINTS,
+    REFERENCE_JOINTS,
+    ZED_BONES,
+    ZED_JOINTS,
+    joint_indices,
+    person_frame,
+    to_frame,
+)
 from mild_viz.errors import UserError
 from mild_viz.live.messages import Observation
 
 REFERENCES = (
     ("left_shoulder", "right_shoulder", "waist", "right_collar"),
-    ("left_shoulder", "right_shoulder", "pelvis", "neck"),
+    REFERENCE_JOINTS,
 )
 """Joints that give a person's frame, as Nuitrack and the ZED SDK name them (`data.skeletons.person_frame`)."""
 
