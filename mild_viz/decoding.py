@@ -7,7 +7,7 @@ which the two arms of a robot follow in its own task space (Sec. Bimanual Robot-
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,10 +19,9 @@ from mild_viz.data.windows import fill_gaps, human_features, max_gap
 from mild_viz.errors import UserError
 from mild_viz.pairs import retarget, retargeted_truth, robot_truth
 from mild_viz.robot.contact import arm_lengths
-from mild_viz.robot.ik import solve_ik
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.objective.terms import IKTerms
-from mild_viz.robot.retarget_arm import MAX_RATE, PRIOR
+from mild_viz.robot.retarget_arm import from_rest, largest_step
 from mild_viz.robot.robots import robot_of
 from mild_viz.robot.source import RobotSource
 from mild_viz.robot.workspace import ARM_OF, HandMap, hand_map
@@ -36,8 +35,6 @@ class Truth(NamedTuple):
     """What a model predicts of every frame: the columns of its windows."""
     joints: Float[np.ndarray, "T J"]
     """What the robot's first arm would make of it [rad]."""
-    others: Mapping[str, Float[np.ndarray, "T _"]] = {}
-    """The same of its other arms, by name."""
 
 
 class Moved(NamedTuple):
@@ -143,31 +140,29 @@ class HandDecoding:
         hands = trial.partner_points
         hands = np.full((trial.n_frames, len(HAND_POINTS), 3), np.nan) if hands is None else hands
         hands = fill_gaps(hands, max_gap(trial.rate))
-        joints, first = self.follow(hands, self.start()), next(iter(self.robot.arms))
-        return Truth(human_features(hands), joints.pop(first), joints)
+        first = next(iter(self.robot.arms))
+        return Truth(human_features(hands), self.follow(hands, self.start(), (first,))[first])
 
     def follow(
-        self, hands: Float[np.ndarray, "T P 3"], carry: Float[np.ndarray, "_"]
+        self,
+        hands: Float[np.ndarray, "T P 3"],
+        carry: Float[np.ndarray, "_"],
+        arms: Collection[str] = tuple(ARM_OF.values()),
     ) -> dict[str, Float[np.ndarray, "T _"]]:
         """By arm, the joints [rad] that bring its hand to where the person's is, as the map says.
 
         Eq. ik-prior-simplified with the resting posture as prior, as in `robot.retarget_arm`, and no joint faster than
         there. NaN where the hands are.
         """
-        targets, joints, start, step = self.map(hands), {}, 0, MAX_RATE / self.rate
+        targets, joints, start = self.map(hands), {}, 0
         for index, arm in enumerate(ARM_OF.values()):
             chain = self.robot.arms[arm]
             previous = carry[start : start + chain.n_joints]
             start += chain.n_joints
-            known = np.logical_and.reduce(np.isfinite(targets[:, index]), axis=1)
-            joints[arm] = solve_ik(
-                chain,
-                targets[:, index],
-                np.where(known[:, None], chain.rest, np.nan),
-                1.0,
-                PRIOR,
-                terms=IKTerms(max_step=step, previous=previous if np.isfinite(previous).all() else None),
-            )
+            if arm in arms:
+                known = np.logical_and.reduce(np.isfinite(targets[:, index]), axis=1)
+                terms = IKTerms(max_step=largest_step(chain, self.rate), previous=previous)
+                joints[arm] = from_rest(chain, targets[:, index], known, terms)
         return joints
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from mild_viz.errors import UserError
 
@@ -31,6 +31,18 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}; choose another place") from None
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a compressed .npz file by `write_atomically`."""
+
+    def write(temporary: Path) -> None:
+        import numpy as np
+
+        with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name
+            np.savez_compressed(file, **arrays)
+
+    write_atomically(path, write)
 
 
 def replace_folder(path: Path, fill: Callable[[Path], Result]) -> Result:

@@ -9,14 +9,13 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mild_viz.data.windows import fill_gaps, human_windows, max_gap, pair_windows
+from mild_viz.data.windows import fill_gaps, human_features, max_gap, pair_windows
 from mild_viz.errors import UserError
 from mild_viz.robot.contact import upright
 from mild_viz.robot.model import RobotModel, load_robot
 from mild_viz.robot.retarget import retarget_pepper
 from mild_viz.robot.retarget_arm import retarget_arm
 from mild_viz.robot.robots import ROBOTS
-from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
 
 
@@ -154,12 +153,12 @@ def stack_windows(trials: Sequence[Trial], joint_names: Sequence[str] | None) ->
     for index, trial in enumerate(trials):
         points, others = fill_gaps(trial.human_points, max_gap(trial.rate)), trial.partner_points
         if joint_names is not None:
-            human, partner = pair_windows(points, robot_truth(trial, joint_names))
+            truth = robot_truth(trial, joint_names)
         elif others is not None:
-            human = human_windows(points)[:-WINDOW]
-            partner = human_windows(fill_gaps(others, max_gap(trial.rate)))[WINDOW:]
+            truth = human_features(fill_gaps(others, max_gap(trial.rate)))
         else:
             raise UserError(f"trial {trial.name} has no second human")
+        human, partner = pair_windows(points, truth)
         humans.append(human)
         partners.append(partner)
         indices.append(np.full(len(human), index))

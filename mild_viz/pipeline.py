@@ -21,8 +21,9 @@ from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_points, check_rate, window_errors
 from mild_viz.prediction import predict
 from mild_viz.robot.contact import in_frame, nearest_wrists
-from mild_viz.robot.control.controller import Frames, make_controller
+from mild_viz.robot.control.controller import Controller, Frames, make_controller
 from mild_viz.robot.control.other_arm import move_other_arms
+from mild_viz.robot.control.rules import ContactRules
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.placement import place_human
 from mild_viz.rollout import Inference, Rollout
@@ -100,7 +101,6 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         partner_decoded=moved.partner,
         partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
         others_decoded=moved.others,
-        others_truth={arm: joints[first] for arm, joints in truth.others.items()},
     )
 
 
@@ -123,18 +123,14 @@ def control(
         UserError: for a controller that does not go with what the model decodes, contact states that do not exist, or
             another arm that cannot be moved as the settings say.
     """
-    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[inference.decodes])
-    settings = with_contact_states(settings, checkpoint, inference.variant, inference.action)
-    transition = checkpoint.transition_state_of(inference.variant, inference.action)
+    controller, crosses = set_up(checkpoint, inference.variant, inference.action, robot, settings, inference.rate)
+    settings, rules = controller.settings, controller.rules
     stored, follow = checkpoint.placement_for(robot.chain), hand_map_of(checkpoint, robot)
     placed = place_human(robot.chain, trial, settings.placement, stored, follow)
     target = in_frame(placed.T_world_human, inference.human_hand)
-    rules = checkpoint.contact_rules_of(inference.action)
-    controller = make_controller(robot, settings, rules, inference.n_states, inference.rate)
-    crossing = inference.log_transition if uses_transition(settings, transition) else None
     frames = Frames(
         log_alpha=inference.log_alpha_human,
-        log_transition=np.full(inference.n_windows, -np.inf) if crossing is None else crossing,
+        log_transition=inference.log_transition if crosses else np.full(inference.n_windows, -np.inf),
         decoded=inference.joints_decoded,
         targets=target,
         tracked=inference.tracked,
@@ -183,6 +179,20 @@ def partner_pose(trial: Trial, T_robot_human: Float[np.ndarray, "4 4"]) -> Float
     return T_robot_human @ np.linalg.inv(trial.T_world_human) @ trial.T_world_partner
 
 
+def set_up(
+    checkpoint: Checkpoint, variant: str, action: str, robot: RobotModel, settings: ControlSettings, rate: float
+) -> tuple[Controller, bool]:
+    """The controller of the interacting arm at `rate` [Hz], and whether it goes by the model's transition state.
+
+    Raises:
+        UserError: for a controller that does not go with what the model decodes, or contact states that do not exist.
+    """
+    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[checkpoint.decodes])
+    settings, rules = with_contact_states(settings, checkpoint, variant, action), checkpoint.contact_rules_of(action)
+    crosses = uses_transition(settings, rules, checkpoint.transition_state_of(variant, action))
+    return make_controller(robot, settings, rules, checkpoint.n_states, rate), crosses
+
+
 def with_contact_states(
     settings: ControlSettings, checkpoint: Checkpoint, variant: str, action: str
 ) -> ControlSettings:
@@ -195,9 +205,9 @@ def with_contact_states(
     return settings
 
 
-def uses_transition(settings: ControlSettings, transition: TransitionState | None) -> bool:
-    """Whether a controller uses a transition state: only if it leads to the contact states that are chosen."""
-    return transition is not None and transition.contact_states == settings.contact_states
+def uses_transition(settings: ControlSettings, rules: ContactRules, transition: TransitionState | None) -> bool:
+    """Whether a controller uses a transition state: if the rules say so, and it leads to the chosen contact states."""
+    return rules.transition_state and transition is not None and transition.contact_states == settings.contact_states
 
 
 def state_visits(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mild_viz.files import write_atomically
+from mild_viz.files import write_arrays
 from mild_viz.settings import Placement
 from mild_viz.trial import ObjectTrack, Skeleton, freeze_arrays
 
@@ -93,7 +93,6 @@ class Inference:
     """The same as recorded; NaN where the truth is unknown."""
     others_decoded: Mapping[str, Float[np.ndarray, "N _"]] = field(default_factory=dict)
     """`joints_decoded` of the robot's other arms, by name; those that are not named rest."""
-    others_truth: Mapping[str, Float[np.ndarray, "N _"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -197,9 +196,4 @@ class Rollout:
         """Write the arrays named in `SAVED`, and in `OTHER_SAVED` of every other arm, to an .npz file, atomically."""
         arrays = {name: self.array(name) for name in SAVED}
         arrays |= {f"{arm.name}_{name}": getattr(arm, name) for arm in self.other_arms for name in OTHER_SAVED}
-
-        def write(temporary: Path) -> None:
-            with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name
-                np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-
-        write_atomically(path, write)
+        write_arrays(path, arrays)

@@ -20,12 +20,12 @@ from mild_viz.decoding import Decoding, decoding_of
 from mild_viz.errors import UserError
 from mild_viz.latent.interaction import InteractionModel, ModelCarry
 from mild_viz.pairs import rates_differ
-from mild_viz.pipeline import uses_transition, with_contact_states
+from mild_viz.pipeline import set_up
 from mild_viz.prediction import advance
 from mild_viz.robot.contact import in_frame
 from mild_viz.robot.control.controller import ControlCarry, Controller, ControlResult, Frames, make_controller
 from mild_viz.robot.model import RobotModel
-from mild_viz.settings import CONTROLLERS_OF, POINT_FEATURES, WINDOW, ControlSettings, choose
+from mild_viz.settings import POINT_FEATURES, WINDOW, ControlSettings, choose
 from mild_viz.trial import WRIST
 
 
@@ -121,13 +121,8 @@ def stream_model(
         raise UserError(
             f"other_arm is {settings.other_arm}; valid for a stream, which drives the arms that the model moves: rest"
         )
-    choose(f"model {checkpoint.name}: controller", settings.controller, CONTROLLERS_OF[checkpoint.decodes])
-    settings = with_contact_states(settings, checkpoint, variant, action)
-    rules, decoding = checkpoint.contact_rules_of(action), decoding_of(checkpoint, robot, rate)
-
-    def controller(arm: str | None) -> Controller:
-        return make_controller(robot, settings, rules, checkpoint.n_states, rate, arm)
-
+    controller, crosses = set_up(checkpoint, variant, action, robot, settings, rate)
+    decoding = decoding_of(checkpoint, robot, rate)
     return StreamModel(
         models=checkpoint.members(variant),
         points=checkpoint.points,
@@ -135,10 +130,13 @@ def stream_model(
         action=action,
         robot=robot,
         decoding=decoding,
-        settings=settings,
-        controller=controller(None),
-        others={arm: controller(arm) for arm in decoding.other_arms},
-        uses_transition=uses_transition(settings, checkpoint.transition_state_of(variant, action)),
+        settings=controller.settings,
+        controller=controller,
+        others={
+            arm: make_controller(robot, controller.settings, controller.rules, checkpoint.n_states, rate, arm)
+            for arm in decoding.other_arms
+        },
+        uses_transition=crosses,
         T_world_human=T_world_human,
         rate=rate,
         max_gap=max_gap(rate),

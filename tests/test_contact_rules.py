@@ -14,7 +14,9 @@ import pytest
 from mild_viz.checkpoint import load_checkpoint, save_checkpoint
 from mild_viz.checkpoint.config import config_of
 from mild_viz.errors import UserError
+from mild_viz.latent.transition import TransitionState
 from mild_viz.paths import checkpoints
+from mild_viz.pipeline import uses_transition
 from mild_viz.robot.control import rules
 from mild_viz.robot.control.controller import Controller, ControlResult, make_controller
 from mild_viz.robot.control.rules import DEFAULT_RULES, RULES, ContactRules, fired_rules, parse_contact_rules
@@ -163,13 +165,22 @@ def test_back_transitions_are_blocked_where_the_rules_say_so() -> None:
 
 
 def test_the_transition_state_counts_where_the_rules_say_so() -> None:
+    states = frozenset({TOUCH})
+    known = TransitionState(np.zeros(2), np.eye(2), 0.1, states)
+    chosen, other = ControlSettings(contact_states=states), ControlSettings(contact_states=frozenset({AWAY}))
+    says, silent = DEFAULT_RULES["handshake"], replace(DEFAULT_RULES["handshake"], transition_state=False)
+    cases = [(chosen, says, known), (chosen, silent, known), (other, says, known), (chosen, says, None)]
+    assert [uses_transition(*case) for case in cases] == [True, False, False, False]
+
+
+def test_the_transition_state_begins_contact() -> None:
     log_alpha, log_transition = visits((REACH, 10), (TOUCH, 5), second=TOUCH), np.full(15, -np.inf)
     log_transition[6] = np.log(0.7)
     rule = DEFAULT_RULES["handshake"]
     result = run(controller(rule), log_alpha, log_transition)
     assert fired(result, rules.CROSSED) == [6] and fired(result, rules.SOFT) == list(range(6, 15))
     assert fired(result, rules.BY_IK) == list(range(10, 15)) == fired(result, rules.IN_CONTACT)
-    without = run(controller(replace(rule, transition_state=False)), log_alpha, log_transition)
+    without = run(controller(rule), log_alpha, np.full(15, -np.inf))
     assert fired(without, rules.CROSSED) == [] and fired(without, rules.SOFT) == list(range(10, 15))
 
 

@@ -206,3 +206,19 @@ def test_the_command_runs_it(tmp_path: Path, handovers: Dataset, capsys: pytest.
     out = tmp_path / "rollout.npz"
     assert main(["rollout", "--dataset", "handover-hands", "--out", str(out)]) in (0, None), capsys.readouterr().err
     assert "task-space" in capsys.readouterr().out and out.is_file()
+
+
+def test_a_slow_arm_is_not_asked_to_be_fast(model: Checkpoint, trial: Trial) -> None:
+    kobo = load_robot("kobo")
+    slow = {name: replace(arm, velocity=np.full(7, 0.5)) for name, arm in kobo.arms.items()}
+    decoding = decoding_of(model, replace(kobo, arms=slow), trial.rate)
+    truth = decoding.truth(trial).joints
+    steps = np.abs(np.diff(truth, axis=0))
+    assert 0.4 < steps.max() * trial.rate <= 0.5 + 1e-9
+
+
+def test_a_robot_that_interacts_with_neither_hand_is_refused(model: Checkpoint) -> None:
+    kobo = load_robot("kobo")
+    arms = {"middle": kobo.arms["right"], **kobo.arms}
+    with pytest.raises(UserError, match="robot 'kobo' interacts with its arm 'middle'; .*right, left; put one of them"):
+        decoding_of(model, replace(kobo, arms=arms), 30.0)

@@ -147,3 +147,11 @@ def test_what_cannot_be_is_refused(model: Checkpoint, robot: RobotModel, handsha
         streaming.stream_model(
             model, "v3.1", "handshake", robot, ControlSettings(other_arm="mild"), np.eye(4), handshake.rate
         )
+
+
+def test_what_cannot_be_mirrored_is_not_offered(handshake: Trial) -> None:
+    """An arm of fewer joints than the mirror's signs: Pepper's without the elbow's roll."""
+    three = load_robot("pepper", load_robot("pepper").chain.joint_names[:3])
+    assert other_arm_options(three, handshake.human_skeleton) == ("rest", "base-ik")
+    with pytest.raises(UserError, match="nothing says how arm 'left' mirrors 'right'"):
+        mirrored(three, "left", three.chain.rest[None])

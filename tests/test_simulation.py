@@ -57,7 +57,7 @@ def hold(
     """A command that stands still, without contact unless grips are given."""
     n = int(seconds * RATE) + 1
     commands = np.tile(posture, (n, 1))
-    settings: dict = {"target": np.full((n, 3), np.nan), "contact": np.zeros(n, dtype=bool)} | more
+    settings: dict = {"target": np.full((n, 3), np.nan)} | more
     return simulate(robot, commands, np.full_like(commands, scale), rate=RATE, **settings)
 
 
@@ -140,8 +140,7 @@ def test_without_inertia_lag_the_command_is_followed(pepper: RobotModel) -> None
     """A slow motion is followed to a millimetre at full stiffness."""
     time = np.arange(201) / RATE
     commands = np.array([0.3, -0.4, 0.6, 0.8]) + 0.1 * np.sin(0.5 * np.pi * time)[:, None]
-    nowhere, never = np.full((201, 3), np.nan), np.zeros(201, dtype=bool)
-    motion = simulate(pepper, commands, np.ones_like(commands), nowhere, never, RATE)
+    motion = simulate(pepper, commands, np.ones_like(commands), np.full((201, 3), np.nan), RATE)
     assert motion.displacement.max() < 0.005
     assert not motion.gripped.any() and motion.force_peak.max() == 0.0
     assert motion.summary().force_peak == 0.0
@@ -210,13 +209,13 @@ def test_simulation_is_deterministic(handshakes: dict[tuple[int, str], Compariso
 
 def test_bad_input_is_refused(pepper: RobotModel) -> None:
     good = np.zeros((5, 4))
-    target, contact = np.zeros((5, 3)), np.zeros(5, dtype=bool)
+    target = np.zeros((5, 3))
     with pytest.raises(UserError, match="stiffness goes from 1.5 to 1.5; valid: 0 to 1"):
-        simulate(pepper, good, good + 1.5, target, contact, RATE)
+        simulate(pepper, good, good + 1.5, target, RATE)
     with pytest.raises(UserError, match="expected finite numbers for RShoulderPitch"):
-        simulate(pepper, good * np.nan, good, target, contact, RATE)
+        simulate(pepper, good * np.nan, good, target, RATE)
     with pytest.raises(UserError, match="rate is 0.0"):
-        simulate(pepper, good, good, target, contact, 0.0)
+        simulate(pepper, good, good, target, 0.0)
     with pytest.raises(UserError, match="stiffness is -1.0; valid: a finite number above 0"):
         HumanHand(stiffness=-1.0)
     with pytest.raises(UserError, match="timestep is 0.0"):

@@ -91,8 +91,13 @@ def test_after_a_long_pause_the_first_window_is_filled_anew(stream: StreamModel,
         carry, _ = fed(stream, handshake.human_arm[:80])
         carry, _ = streaming.idle(stream, carry, pause)
         observed = []
+        lost, _ = streaming.step(stream, carry, np.full((3, 3), np.nan))
+        # what was seen before a long pause bridges no gap after it
+        assert np.isnan(lost.features[-1, :9]).all() == broken
         for arm in handshake.human_arm[110:120]:
+            first = not observed
             carry, command = streaming.step(stream, carry, arm)
+            assert not first or (carry.features[-1, 9:] == 0.0).all() == broken, "no velocity across the pause"
             assert command is not None
             observed.append(bool(np.isfinite(command.log_transition)))
         assert observed == ([False] * 4 + [True] * 6 if broken else [True] * 10)
@@ -101,14 +106,14 @@ def test_after_a_long_pause_the_first_window_is_filled_anew(stream: StreamModel,
 def test_a_short_time_since_the_last_command_moves_it_less(stream: StreamModel, handshake: Trial) -> None:
     """The limits are about the time that the robot has, whatever the clock says."""
     carry, last = fed(stream, handshake.human_arm[:30])
-    limits, moved = stream.controller.limits, {}
-    for seconds in (None, 1 / 30, 0.004, 0.0, -3.0, float("nan"), float("inf"), 5.0):
+    limits, moved, nan = stream.controller.limits, {}, float("nan")
+    for seconds in (None, 1 / 30, 0.004, 0.0, -3.0, nan, float("inf"), 5.0):
         _, command = streaming.step(stream, carry, handshake.human_arm[75], seconds)
         assert command is not None
         moved[seconds] = np.abs(command.joints_commanded - last.joints_commanded)
     np.testing.assert_array_equal(moved[None], moved[1 / 30])
     assert (moved[0.004] <= 0.004 * limits.velocity + 1e-12).all() and moved[0.004].max() < moved[None].max()
-    for seconds in (0.0, -3.0, float("inf")):
+    for seconds in (0.0, -3.0, nan, float("inf")):
         assert (moved[seconds] == 0.0).all()
     assert (moved[5.0] <= 0.2 * limits.velocity + 1e-12).all()
 

@@ -118,6 +118,13 @@ class Description:
             link = above[link].parent
         return tuple(reversed(joints))
 
+    def pose(self, link: str, chosen: dict[str, float]) -> Float[np.ndarray, "4 4"]:
+        """Pose of a link in the base frame, the joints as `values` makes them of those chosen [rad or m]."""
+        values, pose = self.values(chosen), np.eye(4)
+        for joint in self.path_to(link):
+            pose = pose @ joint.motion(values[joint.name])
+        return pose
+
     def values(self, chosen: dict[str, float]) -> dict[str, float]:
         """Value of every joint [rad or m]: as chosen (else 0) within its limits; mimic joints follow."""
         values = {joint.name: float(np.clip(chosen.get(joint.name, 0.0), joint.lower, joint.upper))

@@ -96,12 +96,13 @@ def ik_scratch(n):
 
 
 @njit(cache=True, fastmath=False)
-def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, q, scratch):
+def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, enough, q, scratch):
     """Bounded Levenberg-Marquardt from the prior (J,), with the exact Hessian; the solution is left in `q`.
 
     Minimises Eq. ik-prior-simplified for a target (3,), and the optional terms beside it (`plain_terms(J)`: none).
     No accepted step increases the objective, and no iterate leaves the limits; a NaN target leaves the clipped
-    prior. `scratch` is `ik_scratch(J)`. For velocity limits, give the arm that `limit_step` narrows.
+    prior. A solution that costs no more than `enough` will do; below 0, the best is sought. `scratch` is
+    `ik_scratch(J)`. For velocity limits, give the arm that `limit_step` narrows.
     """
     n = q.shape[0]
     vectors, points, frames, squares, fixed = scratch
@@ -118,6 +119,8 @@ def solve_ik_one(arm, target, prior, lambda_x, lambda_q, terms, q, scratch):
     if not math.isfinite(cost):  # there is no target
         return
     for _ in range(MAX_ITERATIONS):
+        if cost <= enough:
+            return
         derivatives(frames, position, rotation, target, q, prior, lambda_x, lambda_q, terms, gradient, hessian)
         largest = 0.0
         for i in range(n):
@@ -190,14 +193,14 @@ def solve_ik_batch(arm, targets, priors, lambda_x, lambda_q, terms, max_step, pr
     for k in range(n):
         limit_step(arm, previous if k == 0 else solutions[k - 1], max_step, narrowed)
         own = terms[min(k, terms.shape[0] - 1)]
-        solve_ik_one(narrowed, targets[k], priors[k], lambda_x, lambda_q, own, solutions[k], scratch)
+        solve_ik_one(narrowed, targets[k], priors[k], lambda_x, lambda_q, own, -1.0, solutions[k], scratch)
     return solutions
 
 
 @njit(cache=True, fastmath=False)
 def unreachable_one(arm, target, q, tolerance, spare, scratch):
     """Whether the descent of |target - f| alone from `q` inside the limits ends farther than `tolerance`; see `ik`."""
-    solve_ik_one(arm, target, q, 1.0, 0.0, plain_terms(q.shape[0]), spare, scratch)
+    solve_ik_one(arm, target, q, 1.0, 0.0, plain_terms(q.shape[0]), tolerance**2, spare, scratch)
     position, frames = scratch[1][0], scratch[2]
     arm_forward(arm, spare, frames[0], frames[1], position)
     apart = 0.0

@@ -77,11 +77,7 @@ class RobotModel:
         """Height of the floor that the resting robot stands on, in the base frame [m]."""
         footprint = [joint.child for joint in self.description.joints if joint.child == "base_footprint"]
         if footprint:
-            values = self.description.values(dict(self.spec.rest))
-            pose = np.eye(4)
-            for joint in self.description.path_to(footprint[0]):
-                pose = pose @ joint.motion(values[joint.name])
-            return float(pose[2, 3])
+            return float(self.description.pose(footprint[0], dict(self.spec.rest))[2, 3])
         poses = dict(zip(self.link_names, self.tree.resting, strict=True))
         return min((_lowest(mesh, poses[name]) for name, mesh in self.visuals.items()), default=0.0)
 

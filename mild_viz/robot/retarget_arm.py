@@ -11,10 +11,8 @@ posture that can be reached in time.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mild_viz.robot.chain import ArmChain
 from mild_viz.robot.contact import arm_length
@@ -87,10 +85,19 @@ def retarget_arm(
     rotation = np.eye(3) if rotation is None else rotation
     targets = _before_the_base(chain, scaled_wrist(chain, arm, rotation, length))
     seen = np.logical_and.reduce(np.isfinite(np.concatenate([arm.reshape(-1, 9), targets], axis=1)), axis=1)
+    return from_rest(chain, targets, seen, _held(chain, targets, _turned(rotation, arm), rate, previous))
+
+
+def largest_step(chain: ArmChain, rate: float) -> Float[np.ndarray, " J"]:
+    """How far each joint turns from one frame to the next at most [rad]."""
+    return np.minimum(MAX_RATE, chain.velocity) / rate
+
+
+def from_rest(
+    chain: ArmChain, targets: Float[np.ndarray, "T 3"], seen: Bool[np.ndarray, " T"], terms: IKTerms
+) -> Float[np.ndarray, "T J"]:
+    """Joints [rad] that bring the hand to targets [m], near the resting posture; NaN where not `seen`."""
     priors = np.where(seen[:, None], chain.rest, np.nan)  # without a prior there is no solution
-    terms = _held(chain, targets, _turned(rotation, arm), rate)
-    if previous is not None and np.isfinite(previous).all():
-        terms = replace(terms, previous=previous)
     return solve_ik(chain, targets, priors, 1.0, PRIOR, terms=terms)
 
 
@@ -99,7 +106,13 @@ def _turned(rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "*T 3"
     return np.einsum("ij,...j->...i", rotation, points)
 
 
-def _held(chain: ArmChain, targets: Float[np.ndarray, "T 3"], arm: Float[np.ndarray, "T 3 3"], rate: float) -> IKTerms:
+def _held(
+    chain: ArmChain,
+    targets: Float[np.ndarray, "T 3"],
+    arm: Float[np.ndarray, "T 3 3"],
+    rate: float,
+    previous: Float[np.ndarray, " J"] | None,
+) -> IKTerms:
     """The terms of the arm's rule for hands at `targets`; `arm` is the person's, turned into the base frame."""
     rule = chain.position
     outward = _unit((targets - chain.shoulder) * (1.0, 1.0, 0.0))
@@ -115,7 +128,8 @@ def _held(chain: ArmChain, targets: Float[np.ndarray, "T 3"], arm: Float[np.ndar
         elbow_joint=chain.elbow,
         elbow_direction=rule.lean * outward + rule.rise * UP + aside * across,
         joint_weights=np.array(rule.joint_weights) if rule.joint_weights else None,
-        max_step=np.minimum(MAX_RATE, chain.velocity) / rate,
+        max_step=largest_step(chain, rate),
+        previous=previous,
     )
 
 

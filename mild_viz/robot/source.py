@@ -43,8 +43,8 @@ def published_description(spec: RobotSpec, ours: Description) -> Description:
             downloaded or read, or is of another robot: its arms lack joints of ours, or put a link elsewhere.
     """
     theirs = read_description(_download(spec))
+    have = [joint.name for joint in theirs.joints]
     for arm in spec.arms.values():
-        have = [joint.name for joint in theirs.joints]
         missing = [name for name in arm.joints if name not in have]
         if missing:
             raise UserError(f"{theirs.path} has no joint '{missing[0]}' of ours; it has: {', '.join(have)}")
@@ -78,11 +78,7 @@ def _download(spec: RobotSpec) -> Path:
 
 def _frame(description: Description, joint: str, angles: dict[str, float]) -> Float[np.ndarray, "4 4"]:
     """Pose of a joint's child in the base frame; joints without an angle are at 0."""
-    values = description.values(angles)
-    pose = np.eye(4)
-    for above in description.path_to(description.joint(joint).child):
-        pose = pose @ above.motion(values[above.name])
-    return pose
+    return description.pose(description.joint(joint).child, angles)
 
 
 def _compare(spec: RobotSpec, ours: Description, theirs: Description) -> None:

@@ -113,6 +113,11 @@ def hand_map(robot: RobotModel, workspace: Workspace) -> HandMap:
             f"robot '{robot.name}' has no {' and no '.join(missing)} arm, which a model of two hands moves; it has: "
             f"{', '.join(robot.arms)}"
         )
+    if (first := next(iter(robot.arms))) not in ARM_OF.values():
+        raise UserError(
+            f"robot '{robot.name}' interacts with its arm '{first}'; a model of two hands moves: "
+            f"{', '.join(ARM_OF.values())}; put one of them first in its robot.toml"
+        )
     arms = [robot.arms[ARM_OF[point]] for point in HAND_POINTS]
     middle = float(np.mean([arm.shoulder[1] for arm in arms]))
     axes = _grid(arms, middle)

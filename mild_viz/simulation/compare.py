@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mild_viz.files import write_atomically
+from mild_viz.files import write_arrays
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Rollout
+from mild_viz.settings import choose
 from mild_viz.simulation.grip import find_grips
 from mild_viz.simulation.motion import CompliantMotion
 from mild_viz.simulation.settings import HumanHand, Impedance
@@ -50,12 +51,7 @@ class Comparison:
         arrays: dict[str, np.ndarray] = {"joints_commanded": self.joints_commanded, "grips": np.array(self.grips)}
         for name, motion in self.motions.items():
             arrays |= {f"{name}_{field}": getattr(motion, field) for field in type(motion).__dataclass_fields__}
-
-        def write(temporary: Path) -> None:
-            with open(temporary, "wb") as file:  # given a path, numpy would add .npz to its name
-                np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-
-        write_atomically(path, write)
+        write_arrays(path, arrays)
 
 
 def compare(
@@ -66,8 +62,6 @@ def compare(
     hand: HumanHand | None = None,
 ) -> Comparison:
     """Simulate a rollout with fixed full stiffness and with its schedule. Raises `UserError` as `simulate` does."""
-    from mild_viz.settings import choose
-
     choose("scenario", scenario, SCENARIOS)
     rate = rollout.inference.rate
     grips = find_grips(rollout.contact, rollout.end_effector, rollout.target, rate, hand or HumanHand())
@@ -75,8 +69,8 @@ def compare(
     if scenario == "human-led":
         for first, last in grips:
             commanded[first : last + 1] = commanded[first]
-    run = partial(simulate, robot, commanded, target=rollout.target, contact=rollout.contact, rate=rate,
-                  impedance=impedance, hand=hand, grips=grips)  # fmt: skip
+    run = partial(simulate, robot, commanded, target=rollout.target, rate=rate, impedance=impedance, hand=hand,
+                  grips=grips)  # fmt: skip
     stiffnesses = dict(zip(STIFFNESSES, (np.ones_like(commanded), rollout.stiffness), strict=True))
     return Comparison(
         scenario, commanded, grips, {name: run(stiffness=stiffness) for name, stiffness in stiffnesses.items()}

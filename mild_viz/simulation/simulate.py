@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 
 from mild_viz.errors import UserError
 from mild_viz.robot.model import RobotModel
-from mild_viz.simulation.grip import find_grips
 from mild_viz.simulation.model import HAND, build_model, efforts, load_mujoco
 from mild_viz.simulation.motion import CompliantMotion
 from mild_viz.simulation.settings import HumanHand, Impedance
@@ -21,11 +20,10 @@ def simulate(
     joints_commanded: Float[np.ndarray, "N J"],
     stiffness: Float[np.ndarray, "N J"],
     target: Float[np.ndarray, "N 3"],
-    contact: Bool[np.ndarray, " N"],
     rate: float,
     impedance: Impedance | None = None,
     hand: HumanHand | None = None,
-    grips: tuple[tuple[int, int], ...] | None = None,
+    grips: tuple[tuple[int, int], ...] = (),
     start: Float[np.ndarray, " J"] | None = None,
 ) -> CompliantMotion:
     """The arm's motion under the commands [rad] with the human's hand on it.
@@ -38,9 +36,8 @@ def simulate(
 
     Args:
         stiffness: Fraction of full stiffness per joint, 0 to 1.
-        contact: Whether the partners touch; `find_grips` makes grips of it. NaN targets are never gripped.
         rate: Commands a second [Hz].
-        grips: First and last frame of each grip, in place of those.
+        grips: First and last frame of each grip (`find_grips` makes them of contact); the target is known in them.
         start: Joints at the first command, at rest [rad]; None: as commanded.
 
     Raises:
@@ -48,10 +45,8 @@ def simulate(
             are not finite, or the motion diverges.
     """
     impedance, hand = impedance or Impedance(), hand or HumanHand()
-    _check(robot, joints_commanded, stiffness, target, contact, rate)
+    _check(robot, joints_commanded, stiffness, target, rate)
     commanded = robot.end_effector(joints_commanded)
-    if grips is None:
-        grips = find_grips(contact, commanded, target, rate, hand)
     n_frames = len(joints_commanded)
     per_frame = int(np.ceil(1.0 / (rate * impedance.timestep) - 1e-9))
     timestep = 1.0 / (rate * per_frame)
@@ -196,17 +191,16 @@ def _check(
     joints: Float[np.ndarray, "N J"],
     stiffness: Float[np.ndarray, "N J"],
     target: Float[np.ndarray, "N 3"],
-    contact: Bool[np.ndarray, " N"],
     rate: float,
 ) -> None:
     n_frames = len(joints)
     if n_frames < 1 or joints.shape != (n_frames, robot.chain.n_joints) or not np.isfinite(joints).all():
         names = ", ".join(robot.chain.joint_names)
         raise UserError(f"joints have the shape {joints.shape}; expected finite numbers for {names} in every frame")
-    if stiffness.shape != joints.shape or target.shape != (n_frames, 3) or contact.shape != (n_frames,):
+    if stiffness.shape != joints.shape or target.shape != (n_frames, 3):
         raise UserError(
-            f"stiffness, target and contact have the shapes {stiffness.shape}, {target.shape} and {contact.shape}; "
-            f"expected {joints.shape}, {(n_frames, 3)} and {(n_frames,)}"
+            f"stiffness and target have the shapes {stiffness.shape} and {target.shape}; "
+            f"expected {joints.shape} and {(n_frames, 3)}"
         )
     if not (np.isfinite(stiffness).all() and stiffness.min() >= 0.0 and stiffness.max() <= 1.0):
         raise UserError(f"stiffness goes from {stiffness.min()} to {stiffness.max()}; valid: 0 to 1")

@@ -151,14 +151,11 @@ class Controller:
         from mild_viz.robot.control.kernels import control_loop
 
         motion, hand, clock, flags = (array.copy() for array in carry)
-        log_transition = frames.log_transition
-        if not self.rules.transition_state:
-            log_transition = np.full(len(log_transition), -np.inf)
         commands, contact, stiffness, fired = control_loop(
             self.chain.arm,
             *self.packed,
             kernel_array(frames.log_alpha),
-            kernel_array(log_transition),
+            kernel_array(frames.log_transition),
             kernel_array(frames.decoded),
             kernel_array(frames.targets),
             np.require(frames.tracked, dtype=np.bool_, requirements=["C", "W"]),

@@ -170,9 +170,7 @@ def _watch(numbers, tracked, target, seconds, hand, clock):
     """Judge one observation: its bits, and whether it is one to go by. Moves the clock, and remembers the hand."""
     clock[AGE] += seconds
     clock[UNSEEN] += seconds
-    if not tracked:
-        return 1 << rules.MISSING, True
-    if not _finite(target):
+    if not tracked or not _finite(target):
         return 1 << rules.MISSING, True
     if _finite(hand):
         apart = 0.0
@@ -272,7 +270,7 @@ def control_loop(
                 for i in range(size):
                     steps[i] = limits[VELOCITY, i] * dt
                 limit_step(arm, motion[JOINTS], steps, narrowed)
-                solve_ik_one(narrowed, target, prior, numbers[LAMBDA_X], weight, terms, wanted, scratch)
+                solve_ik_one(narrowed, target, prior, numbers[LAMBDA_X], weight, terms, -1.0, wanted, scratch)
                 bits |= 1 << rules.BY_IK
                 if controller == MILD_IK and doubt and not (contact[k] or crossed):
                     bits |= 1 << rules.IN_DOUBT

@@ -28,18 +28,24 @@ def mirrored(robot: RobotModel, name: str, joints: Float[np.ndarray, "N J"]) -> 
     Raises:
         UserError: if robot.toml does not say how that arm mirrors the interacting one.
     """
+    signs = mirror_signs(robot, name)
+    if not signs:
+        raise UserError(
+            f"robot {robot.name}: nothing says how arm '{name}' mirrors '{robot.spec.main.name}'; valid for it: rest, "
+            "base-ik, or mirror_of and mirror_signs in its robot.toml"
+        )
+    return np.clip(joints * np.array(signs), robot.arms[name].lower, robot.arms[name].upper)
+
+
+def mirror_signs(robot: RobotModel, name: str) -> tuple[float, ...]:
+    """What each joint of the interacting arm is multiplied by, to be another arm's; empty where nothing says so."""
     main, other = robot.spec.main, robot.spec.arms[name]
     signs = ()
     if other.mirror_of == main.name:
         signs = other.mirror_signs
     elif main.mirror_of == name:  # signs are their own inverse
         signs = main.mirror_signs
-    if len(signs) != joints.shape[1]:
-        raise UserError(
-            f"robot {robot.name}: nothing says how arm '{name}' mirrors '{main.name}'; valid for it: rest, base-ik, "
-            "or mirror_of and mirror_signs in its robot.toml"
-        )
-    return np.clip(joints * np.array(signs), robot.arms[name].lower, robot.arms[name].upper)
+    return signs if len(signs) == robot.chain.n_joints else ()
 
 
 def other_arm_options(robot: RobotModel, skeleton: Skeleton | None) -> tuple[str, ...]:
@@ -47,8 +53,7 @@ def other_arm_options(robot: RobotModel, skeleton: Skeleton | None) -> tuple[str
     others = list(robot.arms)[1:]
     if not others:
         return ()
-    main = robot.spec.main
-    mirrors = all(main.name == robot.spec.arms[one].mirror_of or main.mirror_of == one for one in others)
+    mirrors = all(mirror_signs(robot, one) for one in others)
     seen = bool(np.isfinite(_left_wrist(skeleton, 1)).any())
     needs = {"rest": (False, False), "mild": (True, False), "base-ik": (False, True), "mild-ik": (True, True)}
     return tuple(name for name in OTHER_ARM if (mirrors or not needs[name][0]) and (seen or not needs[name][1]))
@@ -89,7 +94,9 @@ def move_other_arms(
     settings = replace(controller.settings, controller=chosen)
     arms = []
     for name, chain in list(robot.arms.items())[1:]:
-        if name in others_decoded:
+        if others_decoded and name not in others_decoded:
+            continue  # it rests, as in a stream
+        if others_decoded:
             decoded = others_decoded[name]
         elif chosen == "base-ik":
             decoded = np.tile(chain.rest, (len(hand), 1))
