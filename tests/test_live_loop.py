@@ -78,7 +78,7 @@ def test_a_fault_of_our_own_holds_the_arm_and_ends_nothing(
     turns = count()
 
     def fail(*_: object) -> None:
-        if 80 <= next(turns) < 83:
+        if 80 <= next(turns) < 83:  # in contact
             raise RuntimeError("made to fail")
 
     source = ListInput(frames)
@@ -102,6 +102,8 @@ def test_a_fault_of_our_own_holds_the_arm_and_ends_nothing(
     assert len(held) == (3 if where == "controller" else 0)
     for n in held:
         np.testing.assert_array_equal(sent[n].positions, sent[n - 1].positions)
+        np.testing.assert_array_equal(sent[n].stiffness, sent[n - 1].stiffness)
+        assert sent[n].contact and sent[n - 1].contact and sent[n].stiffness.max() < 1.0
         assert sent[n].observed is None
     assert len(sent) > 150 and np.isfinite([command.positions for command in sent]).all()
     np.testing.assert_allclose(sent[-1].positions, model.controller.limits.rest, atol=0.01)
