@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,9 @@ from mild_viz.live.config import LiveConfig
 from mild_viz.live.controller import LiveController
 from mild_viz.live.feed import Feed, Figures, Snapshot, channel, newest
 from mild_viz.live.latency import Times
-from mild_viz.live.loop import LiveLoop
+from mild_viz.live.loop import FAULT, LiveLoop, Tick
+from mild_viz.live.messages import Observation
+from mild_viz.live.onset import INTERACTING
 from mild_viz.live.person import skeleton_bones
 from mild_viz.live.setup import NOMINAL_ARM, make_guard
 from mild_viz.paths import default_checkpoint
@@ -105,6 +108,33 @@ def test_the_page_gets_the_newest_snapshot_and_no_more_than_asked_for(
     latest = newest(theirs, 0.1)
     assert latest is not None and latest.number > first.number and newest(theirs, 0.01) is None
     assert latest.figures.counts is not None and first.names
+
+
+def test_faults_that_last_are_told_too(model: StreamModel, ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = ends
+    loop, _ = fed_loop(model, ours, rate=100.0)
+    original, turns = loop.controller.observe, count()
+
+    def failing(seen: Observation, now: float) -> object:
+        if next(turns) < 80:
+            return original(seen, now)
+        raise RuntimeError("made to fail")
+
+    told: list[Snapshot] = []
+    ticks: list[Tick] = []
+    monkeypatch.setattr(loop.controller, "observe", failing)
+    monkeypatch.setattr("mild_viz.live.feed.STATUS_PERIOD", 0.05)
+    loop.witnesses = (*loop.witnesses, ticks.append, lambda _: told.extend(snapshots(theirs)))
+    loop.run(lambda: False)
+    faulted = [each for each in told if FAULT in each.fired]
+    assert len(faulted) > 5
+    before = next(tick for tick, after in zip(ticks, ticks[1:], strict=False) if after.fault)
+    assert before.decision is not None and before.sent is not None
+    assert faulted[-1].figures.last_fault == "RuntimeError: made to fail"
+    for each in faulted:
+        assert not each.answers and each.phase == INTERACTING
+        assert each.contact == before.sent.contact and each.stiffness == before.sent.stiffness.min()
+        np.testing.assert_array_equal(each.log_alpha, before.decision.command.log_alpha)
 
 
 @pytest.fixture(scope="module")
