@@ -15,7 +15,7 @@ from live_streams import ListInput, ListOutput, demo_model, stream
 
 from mild_viz.data.load import load_dataset
 from mild_viz.live.config import LiveConfig
-from mild_viz.live.controller import LiveController
+from mild_viz.live.controller import STOPPED, LiveController
 from mild_viz.live.loop import FAULT, LiveLoop, Tick
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
@@ -192,6 +192,6 @@ def test_it_stops_when_told_and_after_its_time(model: StreamModel, frames: list[
     turns = count()
     loop, sent = make_loop(model, ListInput(frames, pause=0.005))
     loop.run(lambda: next(turns) > 75)
-    assert loop.controller.tracker.reason == "the program ends"
+    assert loop.controller.tracker.reason == STOPPED
     assert 75 < len(sent) < 180, "the arm goes to rest first"
     np.testing.assert_allclose(sent[-1].positions, model.controller.limits.rest, atol=0.01)

@@ -17,7 +17,7 @@ from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import observed_rows, unobserved_forward
 from mild_viz.live.config import LiveConfig
-from mild_viz.live.controller import Decision, LiveController
+from mild_viz.live.controller import STOPPED, Decision, LiveController
 from mild_viz.live.loop import Tick
 from mild_viz.live.onset import INTERACTING, RETURNING
 from mild_viz.live.person import skeleton_bones
@@ -240,10 +240,13 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
 def rerun(session: Session, model: StreamModel, config: LiveConfig) -> Iterator[tuple[Tick, Decision | None]]:
     """Every turn of a session, and what is decided in it with this model and these thresholds.
 
-    With the session's own, the decisions are the recorded ones, to the bit.
+    With the session's own, the decisions are the recorded ones, to the bit: up to the first turn with a `fault`, since
+    nobody knows how much of it was done.
     """
     controller = LiveController(model, config)
     for tick in session.ticks:
+        if tick.decision is not None and tick.decision.note == STOPPED:
+            controller.stop()
         if tick.seen is not None:
             yield tick, controller.observe(tick.seen, tick.time)
         else:
