@@ -169,7 +169,7 @@ def test_an_interaction_is_a_trial_for_the_pipeline(recorded: tuple[Session, lis
 def test_the_rollout_of_a_session_is_what_was_sent(recorded: tuple[Session, list[Tick]]) -> None:
     session, ticks = recorded
     checkpoint = session_checkpoint(session)
-    rollout = recorded_rollout(session, 1, 0, checkpoint, session_robot(session, checkpoint))
+    rollout = recorded_rollout(session, interactions(session)[1], 0, checkpoint, session_robot(session, checkpoint))
     sent = [tick for tick in ticks if tick.sent and tick.decision and tick.decision.interaction == 1
             and tick.decision.phase in ("interacting", "returning")]  # fmt: skip
     assert rollout.inference.n_windows == len(sent)

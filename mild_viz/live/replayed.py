@@ -132,19 +132,19 @@ def session_dataset(session: Session) -> Dataset:
     Raises:
         UserError: if it holds none.
     """
-    trials = tuple(session_trial(session, number, index) for index, number in enumerate(interactions(session)))
+    trials = tuple(session_trial(session, ticks, index) for index, ticks in enumerate(interactions(session).values()))
     if not trials:
         raise UserError(f"{session.path} holds no interaction: the hand never left its resting place")
     return Dataset(DATASET, f"Live session {session.path.name}", (), trials, session.header["checkpoint"]["checksum"])
 
 
-def session_trial(session: Session, number: int, index: int) -> Trial:
-    """One interaction as a trial, from what the model was given before its start to the last frame that it took.
+def session_trial(session: Session, ticks: tuple[Tick, ...], index: int) -> Trial:
+    """One of its `interactions` as a trial, from what the model was given before its start to the last frame that it took.
 
     Row n of its inference belongs to sample n + 4, the last row to the last sample: five frames that no row reads
     stand at the end, where a recording has the ones that are predicted.
     """
-    samples = np.array([sample for tick in interactions(session)[number] for sample in _decision(tick).samples])
+    samples = np.array([sample for tick in ticks for sample in _decision(tick).samples])
     names = tuple(session.header["robot"]["joint_names"])
     return Trial(
         dataset=DATASET,
@@ -159,9 +159,10 @@ def session_trial(session: Session, number: int, index: int) -> Trial:
     )
 
 
-def recorded_rollout(session: Session, number: int, index: int, checkpoint: Checkpoint, robot: RobotModel) -> Rollout:
-    """One interaction exactly as it was: row n is the n-th command that was sent."""
-    ticks = interactions(session)[number]
+def recorded_rollout(
+    session: Session, ticks: tuple[Tick, ...], index: int, checkpoint: Checkpoint, robot: RobotModel
+) -> Rollout:
+    """One of its `interactions` exactly as it was: row n is the n-th command that was sent."""
     header, settings = session.header, session_settings(session)
     said = [_decision(tick).command for tick in ticks]
     model = checkpoint.members(header["variant"])[0]

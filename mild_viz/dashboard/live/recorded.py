@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mild_viz import pipeline
 from mild_viz.checkpoint import Checkpoint
+from mild_viz.live.loop import Tick
 from mild_viz.live.replayed import (
     interactions,
     recorded_rollout,
@@ -42,6 +43,10 @@ class RecordedSession:
     def dataset(self) -> Dataset:
         """Its interactions as trials."""
         return session_dataset(self.session)
+
+    @cached_property
+    def _interactions(self) -> tuple[tuple[Tick, ...], ...]:
+        return tuple(interactions(self.session).values())
 
     @property
     def variant(self) -> str:
@@ -81,8 +86,8 @@ class RecordedSession:
 
     def _rollout(self, index: int) -> Rollout:
         if index not in self._rollouts:
-            number = list(interactions(self.session))[index]
-            self._rollouts[index] = recorded_rollout(self.session, number, index, self.checkpoint, self.robot)
+            ticks = self._interactions[index]
+            self._rollouts[index] = recorded_rollout(self.session, ticks, index, self.checkpoint, self.robot)
         return self._rollouts[index]
 
 
