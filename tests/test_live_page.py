@@ -22,6 +22,8 @@ from test_live_command import HOST, ended, free_port, live, number
 
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.dashboard.live import status
+from mild_viz.dashboard.live.page import LivePage
+from mild_viz.dashboard.live.start import PageSetup
 from mild_viz.dashboard.live.template import resting_rollout, sigma_points
 from mild_viz.data.load import load_dataset
 from mild_viz.live.config import LiveConfig
@@ -147,7 +149,7 @@ def snapshot(model: StreamModel) -> Snapshot:
         robot_latent=np.zeros(5),
         figures=Figures(Times(5e-4, 9e-4, 1e-3), Times(1e-3, 4e-3, 2e-2), 60.0, 30.0, {"received": 70, "rejected": 3},
                         {"stale": 2, "untracked": 1, "held": 4}, {"sent": 33}, refused=7, faults=1,
-                        last_fault="ValueError: <b>", page_dropped=5, recorded=99),
+                        last_fault="ValueError: <b>", recorded=99),
     )  # fmt: skip
 
 
@@ -155,7 +157,7 @@ def test_the_panel_says_what_holds(snapshot: Snapshot) -> None:
     now = re.sub("<[^>]+>", " ", status.now_html(snapshot, LiveConfig()))
     for text in ("interacting", "12.3 cm", "40 %", "The most likely state is a contact state.", "&lt;i&gt;"):
         assert text in now, text
-    figures = re.sub("<[^>]+>", " ", status.figures_html(snapshot.figures, 1))
+    figures = re.sub("<[^>]+>", " ", status.figures_html(snapshot.figures, 6))
     for text in ("0.50 / 0.90 ms", "1.00 / 4.00 ms", "60 / 30 a second", " 7 ", " 99 ", " 6 "):
         assert text in figures, text
     trouble = status.trouble_html(replace(snapshot.figures, troubles=("recording stopped",)), silent=3.2)
@@ -166,6 +168,24 @@ def test_the_panel_says_what_holds(snapshot: Snapshot) -> None:
     assert "start displacement" in thresholds and "0.0224" in thresholds
     idle = replace(snapshot, phase="waiting", log_alpha=np.full(6, np.nan), displacement=float("nan"), fired=())
     assert "reach out" in status.now_html(idle, LiveConfig()) and "none" in status.now_html(idle, LiveConfig())
+
+
+def test_the_panel_counts_the_snapshots_that_never_came(
+    model: StreamModel, snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setup = PageSetup(
+        HOST, free_port(socket.SOCK_STREAM), default_checkpoint("demo"), model.variant, model.action, "pepper", "own",
+        model.settings, model.T_world_human, LiveConfig(), "list", "list",
+    )  # fmt: skip
+    page = LivePage(setup)
+    try:
+        monkeypatch.setattr(page.server, "get_clients", lambda: {0: None})
+        monkeypatch.setattr("mild_viz.dashboard.live.page.PANEL_PERIOD", 0.0)
+        for n in (1, 4):
+            page.show(replace(snapshot, number=n))
+        assert "<td>Frames this page left out</td><td>2</td>" in page._figures.content
+    finally:
+        page.server.stop()
 
 
 def test_the_chart_shows_the_last_seconds_of_every_state(snapshot: Snapshot) -> None:

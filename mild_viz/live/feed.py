@@ -46,8 +46,6 @@ class Figures:
     troubles: tuple[str, ...] = ()
     recorded: int | None = None
     """Turns in the session's file; None where none is written."""
-    page_dropped: int = 0
-    """Snapshots that the page did not take in time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +92,7 @@ class Feed:
         self._decision: Decision | None = None
         """The last one: what the model says is as it was then, where a fault leaves none."""
         self.dropped = 0
+        """Snapshots that the page did not take in time."""
         self.gone = False
         """Whether the page's process is no more."""
 
@@ -169,7 +168,6 @@ class Feed:
             last_fault=loop.last_fault,
             troubles=tuple(trouble for trouble in troubles if trouble),
             recorded=None if recorder is None else recorder.written,
-            page_dropped=self.dropped,
         )
 
 

@@ -125,7 +125,7 @@ def figures_html(figures: Figures, page_behind: int) -> str:
         ("made without a frame", done.get("held", 0)),
         ("cut by the last check", figures.refused),
         ("Clock jumps, faults", f"{figures.clock_jumps}, {figures.faults}"),
-        ("Frames this page left out", figures.page_dropped + page_behind),
+        ("Frames this page left out", page_behind),
     ]
     if figures.recorded is not None:
         counts.append(("Turns recorded", figures.recorded))
