@@ -147,7 +147,7 @@ def snapshot(model: StreamModel) -> Snapshot:
         positions=None, arm=NOMINAL_ARM, commanded=np.zeros(4), decoded=np.zeros(4), stiffness=0.4, contact=True,
         fired=("contact", "soft"), log_alpha=np.log(np.full(n_states, 1.0 / n_states)), human_latent=np.zeros(5),
         robot_latent=np.zeros(5),
-        figures=Figures(Times(5e-4, 9e-4, 1e-3), Times(1e-3, 4e-3, 2e-2), 60.0, 30.0, {"received": 70, "rejected": 3},
+        figures=Figures(Times(5e-4, 9e-4, 1e-3), Times(1e-3, 4e-3, 2e-2), 60.0, 30.0, {"received": 70, "last_error": "not JSON"},
                         {"stale": 2, "untracked": 1, "held": 4}, {"sent": 33}, refused=7, faults=1,
                         last_fault="ValueError: <b>", recorded=99),
     )  # fmt: skip
@@ -161,7 +161,7 @@ def test_the_panel_says_what_holds(snapshot: Snapshot) -> None:
     for text in ("0.50 / 0.90 ms", "1.00 / 4.00 ms", "60 / 30 a second", " 7 ", " 99 ", " 6 "):
         assert text in figures, text
     trouble = status.trouble_html(replace(snapshot.figures, troubles=("recording stopped",)), silent=3.2)
-    for text in ("recording stopped", "ValueError: &lt;b&gt;", "for 3 s"):
+    for text in ("recording stopped", "ValueError: &lt;b&gt;", "for 3 s", "Last error of the input: not JSON"):
         assert text in trouble, text
     assert status.trouble_html(Figures(), 0.1) == ""
     thresholds = status.config_html(LiveConfig())

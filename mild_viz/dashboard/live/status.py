@@ -139,8 +139,8 @@ def trouble_html(figures: Figures, silent: float) -> str:
         lines.insert(0, f"No word from the control process for {silent:.0f} s: what is shown is old")
     for label, text in (
         ("Last fault", figures.last_fault),
-        ("Last rejected frame", (figures.input_counts or {}).get("last_error", "")),
-        ("Last command that failed", (figures.output_counts or {}).get("last_error", "")),
+        ("Last error of the input", (figures.input_counts or {}).get("last_error", "")),
+        ("Last error of the output", (figures.output_counts or {}).get("last_error", "")),
     ):
         if text:
             lines.append(f"{label}: {text}")
