@@ -139,7 +139,7 @@ def session_dataset(session: Session) -> Dataset:
 
 
 def session_trial(session: Session, ticks: tuple[Tick, ...], index: int) -> Trial:
-    """One of its `interactions` as a trial, from what the model was given before its start to the last frame that it took.
+    """One of its `interactions` as a trial, from what the model got before its start to the last frame that it took.
 
     Row n of its inference belongs to sample n + 4, the last row to the last sample: five frames that no row reads
     stand at the end, where a recording has the ones that are predicted.
