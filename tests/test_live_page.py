@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -23,8 +23,10 @@ from test_live_command import HOST, ended, free_port, live, number
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.dashboard.live import status
 from mild_viz.dashboard.live.page import LivePage
+from mild_viz.dashboard.live.scene import MOVED
 from mild_viz.dashboard.live.start import PageSetup
 from mild_viz.dashboard.live.template import resting_rollout, sigma_points
+from mild_viz.dashboard.scene.figure import Figure, skeleton_figure
 from mild_viz.data.load import load_dataset
 from mild_viz.live.config import LiveConfig
 from mild_viz.live.controller import LiveController
@@ -34,6 +36,7 @@ from mild_viz.live.loop import FAULT, LiveLoop, Tick
 from mild_viz.live.messages import Observation
 from mild_viz.live.onset import INTERACTING
 from mild_viz.live.person import skeleton_bones
+from mild_viz.live.replay import recorded_joints
 from mild_viz.live.setup import NOMINAL_ARM, make_guard
 from mild_viz.paths import default_checkpoint
 from mild_viz.settings import ControlSettings
@@ -171,22 +174,49 @@ def test_the_panel_says_what_holds(snapshot: Snapshot) -> None:
     assert "reach out" in status.now_html(idle, LiveConfig()) and "none" in status.now_html(idle, LiveConfig())
 
 
-def test_the_panel_counts_the_snapshots_that_never_came(
-    model: StreamModel, snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture(scope="module")
+def page(model: StreamModel) -> Iterator[LivePage]:
     setup = PageSetup(
         HOST, free_port(socket.SOCK_STREAM), default_checkpoint("demo"), model.variant, model.action, "pepper", "own",
         model.settings, model.T_world_human, LiveConfig(), "list", "list",
     )  # fmt: skip
     page = LivePage(setup)
-    try:
-        monkeypatch.setattr(page.server, "get_clients", lambda: {0: None})
-        monkeypatch.setattr("mild_viz.dashboard.live.page.PANEL_PERIOD", 0.0)
-        for n in (1, 4):
-            page.show(replace(snapshot, number=n))
-        assert "<td>Frames this page left out</td><td>2</td>" in page._figures.content
-    finally:
-        page.server.stop()
+    yield page
+    page.server.stop()
+
+
+def test_the_panel_counts_the_snapshots_that_never_came(
+    page: LivePage, snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page.server, "get_clients", lambda: {0: None})
+    monkeypatch.setattr("mild_viz.dashboard.live.page.PANEL_PERIOD", 0.0)
+    for n in (1, 4):
+        page.show(replace(snapshot, number=n))
+    assert "<td>Frames this page left out</td><td>2</td>" in page._figures.content
+
+
+def test_a_trunk_that_is_lost_stays_where_it_was(
+    page: LivePage, snapshot: Snapshot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, body = recorded_joints(load_dataset("demo").test[4])
+    drawn = count()
+
+    def counted(*arguments: Any) -> Figure:
+        next(drawn)
+        return skeleton_figure(*arguments)
+
+    page.scene.follow(replace(snapshot, names=names, positions=body[0]))  # lays the scene out
+    monkeypatch.setattr("mild_viz.dashboard.live.scene.skeleton_figure", counted)
+    page.scene.follow(replace(snapshot, names=names, positions=body[0]))
+    assert next(drawn) == 1, "of a body that is seen whole, one figure does"
+    live = page.scene._live_figure
+    before = {name: getattr(live, name).copy() for name in MOVED}
+    moved = body[80].copy()
+    moved[[n for n, name in enumerate(names) if name not in ("right_elbow", "right_wrist", "right_hand")]] = np.nan
+    page.scene.follow(replace(snapshot, names=names, positions=moved))
+    for name in ("torso_poses", "head_positions"):
+        np.testing.assert_array_equal(getattr(live, name), before[name])
+    assert not np.allclose(live.ball_positions, before["ball_positions"], equal_nan=True)
 
 
 def test_the_chart_shows_the_last_seconds_of_every_state(snapshot: Snapshot) -> None:

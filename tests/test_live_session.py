@@ -54,9 +54,7 @@ def model() -> StreamModel:
     return demo_model(controller="mild-ik", lambda_q=0.02)
 
 
-def run(
-    model: StreamModel, path: Path, trials: tuple[int, ...] = (HANDSHAKE,), turns: int = sys.maxsize
-) -> list[Tick]:
+def run(model: StreamModel, path: Path, trials: tuple[int, ...] = (HANDSHAKE,), turns: int = sys.maxsize) -> list[Tick]:
     """Record a session of several trials in a row, each followed by silence; stop after so many turns."""
     frames: list = []
     for trial in trials:
