@@ -13,10 +13,11 @@ import tyro
 
 from mild_viz.checkpoint import Checkpoint, load_checkpoint
 from mild_viz.data.demo import joint_noise
-from mild_viz.data.load import load_dataset
+from mild_viz.data.demo_body import DEMO_JOINTS
+from mild_viz.data.load import data_root, load_dataset, missing_files
 from mild_viz.data.skeletons import ARM_JOINTS
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
-from mild_viz.live.config import LiveConfig
+from mild_viz.live.config import RESTS, LiveConfig
 from mild_viz.live.onset import INTERACTING, RETURNING, PhaseTracker
 from mild_viz.pairs import robot_truth
 from mild_viz.paths import default_checkpoint
@@ -24,7 +25,10 @@ from mild_viz.prediction import predict
 from mild_viz.settings import WINDOW
 from mild_viz.trial import Trial
 
-LEADS = (5, 10, 15, 20, 30, 45)
+LEADS = (5, 10, 15, 20, 29, 45)
+"""Frames: 0.17 to 1.5 s at 30 Hz."""
+
+HAND = ARM_JOINTS.index("right_wrist")
 
 
 def with_rest(trial: Trial, seconds: float) -> tuple[np.ndarray, int]:
@@ -39,7 +43,7 @@ def phases(arm: np.ndarray, rate: float, config: LiveConfig) -> tuple[int | None
     """The frames at which the first interaction begins and ends, and why it ends."""
     tracker = PhaseTracker(config)
     start = None
-    for frame, hand in enumerate(arm[:, 2]):
+    for frame, hand in enumerate(arm[:, HAND]):
         phase = tracker.update(frame / rate, hand)
         if phase == INTERACTING and start is None:
             start = frame
@@ -53,7 +57,7 @@ def leaves(trial: Trial) -> int:
     it was at first, before it is 10 cm away."""
     if trial.phase is not None:
         return int(np.argmax(trial.phase > 0))
-    hand = trial.human_arm[:, 2]
+    hand = trial.human_arm[:, HAND]
     away = np.linalg.norm(hand - np.nanmedian(hand[:3], axis=0), axis=1)
     near = np.flatnonzero(away[: int(np.argmax(away > 0.1))] < 0.01)
     return int(near[-1]) + 1 if len(near) else 0
@@ -85,6 +89,24 @@ def report_starts(dataset: str, rest: float, config: LiveConfig) -> None:
     print(f"  {cut} recordings end before the interaction does")
 
 
+def report_rests(config: LiveConfig) -> None:
+    """How long recordings go on before a start is seen, the first frame held for a second before them."""
+    for dataset, used in RESTS.items():
+        if missing_files(dataset, data_root()):
+            print(f"{dataset} is not here; RESTS says {used:g} s")
+            continue
+        seconds = []
+        for trial in load_dataset(dataset).train:
+            arm, before = with_rest(trial, 1.0)
+            start, _, _ = phases(arm, trial.rate, config)
+            if start is not None:
+                seconds.append((start - before) / trial.rate)
+        print(
+            f"{dataset}: {len(seconds)} training trials go on for {np.median(seconds):.2f} s, in the median, before a "
+            f"start is seen; RESTS says {used:g} s"
+        )
+
+
 def report_rest(minutes: float, config: LiveConfig) -> None:
     """False starts while a hand rests, with the demo set's tracking error."""
     rng = np.random.default_rng(0)
@@ -92,7 +114,7 @@ def report_rest(minutes: float, config: LiveConfig) -> None:
     for _ in range(round(minutes)):
         tracker = PhaseTracker(config)
         for frame, body in enumerate(joint_noise(rng, 1800)[:, 0]):
-            if tracker.update(frame / 30.0, body[16 % len(body)]) == INTERACTING:
+            if tracker.update(frame / 30.0, body[DEMO_JOINTS.index("right_wrist")]) == INTERACTING:
                 starts += 1
                 break
     print(f"resting hand with tracking error: {starts} false starts in {minutes:g} minutes")
@@ -126,6 +148,7 @@ def main(minutes: float = 30.0) -> None:
     for dataset, rest in (("demo", 0.0), ("nuisi", 1.0)):
         report_starts(dataset, rest, config)
     report_rest(minutes, config)
+    report_rests(config)
     print(
         f"\nmean squared error [rad^2] from the start to the end; the model begins so many frames before: {LEADS}, all"
     )
@@ -139,5 +162,4 @@ def main(minutes: float = 30.0) -> None:
 
 
 if __name__ == "__main__":
-    assert ARM_JOINTS[2] == "right_wrist"
     tyro.cli(main)

@@ -15,7 +15,7 @@ from live_streams import ListInput, ListOutput, demo_model, stream
 
 from mild_viz.data.load import load_dataset
 from mild_viz.live.config import LiveConfig
-from mild_viz.live.controller import LiveController
+from mild_viz.live.controller import STOPPED, LiveController
 from mild_viz.live.loop import FAULT, LiveLoop, Tick
 from mild_viz.live.messages import JointCommand, Observation
 from mild_viz.live.onset import INTERACTING
@@ -78,7 +78,7 @@ def test_a_fault_of_our_own_holds_the_arm_and_ends_nothing(
     turns = count()
 
     def fail(*_: object) -> None:
-        if 80 <= next(turns) < 83:
+        if 80 <= next(turns) < 83:  # in contact
             raise RuntimeError("made to fail")
 
     source = ListInput(frames)
@@ -102,6 +102,8 @@ def test_a_fault_of_our_own_holds_the_arm_and_ends_nothing(
     assert len(held) == (3 if where == "controller" else 0)
     for n in held:
         np.testing.assert_array_equal(sent[n].positions, sent[n - 1].positions)
+        np.testing.assert_array_equal(sent[n].stiffness, sent[n - 1].stiffness)
+        assert sent[n].contact and sent[n - 1].contact and sent[n].stiffness.max() < 1.0
         assert sent[n].observed is None
     assert len(sent) > 150 and np.isfinite([command.positions for command in sent]).all()
     np.testing.assert_allclose(sent[-1].positions, model.controller.limits.rest, atol=0.01)
@@ -190,6 +192,6 @@ def test_it_stops_when_told_and_after_its_time(model: StreamModel, frames: list[
     turns = count()
     loop, sent = make_loop(model, ListInput(frames, pause=0.005))
     loop.run(lambda: next(turns) > 75)
-    assert loop.controller.tracker.reason == "the program ends"
+    assert loop.controller.tracker.reason == STOPPED
     assert 75 < len(sent) < 180, "the arm goes to rest first"
     np.testing.assert_allclose(sent[-1].positions, model.controller.limits.rest, atol=0.01)

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_live_session import demo_model, run
 
+from mild_viz import pipeline
 from mild_viz.cli import main
 from mild_viz.dashboard.app import Dashboard, open_dashboard
 from mild_viz.dashboard.live.recorded import open_recorded
 from mild_viz.dashboard.server import free_port
+from mild_viz.live.config import LiveConfig
 from mild_viz.live.replayed import interactions
 from mild_viz.paths import default_checkpoint
+from mild_viz.robot.control.rules import JUMPED
+from mild_viz.settings import Placement, Watch
 
 HOST = "127.0.0.1"
+STATES = frozenset({1, 4})
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sessions") / "session.jsonl"
-    run(demo_model(lambda_q=0.1, smoothing=0.6), path, (4, 4))
+    config = replace(LiveConfig(), max_speed=1.0)  # slower than a reach: the jump rule fires
+    place = Placement(0.7, 0.1, 0.2)
+    run(demo_model(config=config, lambda_q=0.1, smoothing=0.6, placement=place, contact_states=STATES), path, (4, 4))
     return path
 
 
@@ -52,6 +60,7 @@ def test_the_page_shows_what_was_sent_until_settings_change(dashboard: Dashboard
     assert page.rollout.inference.dataset == "session, as recorded"
     control = page.choice.settings.control
     assert (control.lambda_q, control.smoothing) == (0.1, 0.6), "the widgets say what was recorded"
+    assert control.contact_states == page.rollout.contact_states == STATES
     assert (
         page.choice.trial.name == "session/test/0"
         and len(dashboard.controls._catalog.trials("session", "handshake")) == 2
@@ -63,10 +72,33 @@ def test_the_page_shows_what_was_sent_until_settings_change(dashboard: Dashboard
     assert page.wait_idle() and page.error is None
     assert page.rollout.controller == "mild" and page.rollout.inference.dataset == "session"
     assert page.rollout.inference.n_windows != len(sent(session, 1)), "a row for every frame again"
+    inference, choice, recorded = page.rollout.inference, page.choice, open_recorded(session).settings
+    expected = pipeline.control(
+        inference, choice.checkpoint, choice.robot, choice.trial, replace(recorded, controller="mild")
+    )
+    np.testing.assert_array_equal(page.rollout.joints_commanded, expected.joints_commanded)
+    np.testing.assert_array_equal(page.rollout.target, expected.target)
+    assert (page.rollout.fired == expected.fired).all() and (expected.fired & 1 << JUMPED).any()
+    assert page.rollout.placement == recorded.placement and page.rollout.contact_states == STATES
     tab._controller.value = "mild-ik"
     page.mark_dirty()
     assert page.wait_idle() and page.error is None
     np.testing.assert_array_equal(page.rollout.joints_commanded, sent(session, 1))
+
+
+def test_the_first_settings_stand_for_the_recorded_ones_whatever_variant_they_come_with(session: Path) -> None:
+    recorded = open_recorded(session)
+    checkpoint, robot, trial = recorded.checkpoint, recorded.robot, recorded.dataset.test[0]
+    states = checkpoint.contact_states_of("v4", "handshake")
+    read = replace(recorded.settings, watch=Watch(), placement=None)  # as the widgets do
+    for variant, settings, name in (
+        ("v4", replace(read, contact_states=states), "session"),
+        ("v3.1", replace(read, smoothing=1.0), "session"),
+        ("v3.1", read, "session, as recorded"),
+    ):
+        inference = recorded.infer(checkpoint, trial, variant, robot)
+        rollout = recorded.control(inference, checkpoint, robot, trial, settings)
+        assert rollout.inference.dataset == name, (variant, settings)
 
 
 def test_the_other_interaction_can_be_chosen(dashboard: Dashboard, session: Path) -> None:

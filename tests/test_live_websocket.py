@@ -93,7 +93,7 @@ def test_a_server_that_goes_and_comes_back() -> None:
     assert source.poll(0.02) is None and not source.finished
     with tracker(says(frame(2)), port):
         assert arrives(source).sequence == 2
-        assert source.trouble == ""
+        assert source.trouble == source.counts.last_error == "", "it is over"
     source.close()
 
 

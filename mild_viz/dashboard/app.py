@@ -52,6 +52,10 @@ class Dashboard:
             self.server, catalog, first, model, lambda: self.session.mark_dirty(), self.scene.move_camera,
             self._write_html, self._write_csv, ControlSettings() if recorded is None else recorded.settings,
         )  # fmt: skip
+        if recorded is not None:
+            self.controls.remember_contact_states(
+                catalog.checkpoint(model), recorded.variant, recorded.action, recorded.settings.contact_states
+            )
         self.timeline = Timeline(self.server, self.player)
         self._compared: tuple[Rollout | None, dict[str, Rollout]] = None, {}
         """What was last compared, and the rollout that it belongs to."""

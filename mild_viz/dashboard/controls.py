@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 import viser
 
-from mild_viz.checkpoint import save_contact_states
+from mild_viz.checkpoint import Checkpoint, save_contact_states
 from mild_viz.dashboard.catalog import Catalog
 from mild_viz.dashboard.readout import distance_html, rules_text, state_html, stiffness_text
 from mild_viz.dashboard.session import Choice
@@ -92,6 +92,13 @@ class Controls:
         self._states.show(rollout)
         self._compare_contact_states(rollout.contact_states, choice)
         set_content(self._header, header_html(rollout, self._model_of(choice)))
+
+    def remember_contact_states(
+        self, checkpoint: Checkpoint, variant: str, action: str, states: frozenset[int] | None
+    ) -> None:
+        """Tick these once this model and action are shown, not the model's own."""
+        if states is not None:
+            self._states.remember(checkpoint, variant, action, states)
 
     def offer_datasets(self) -> None:
         """Complete the list of datasets, which takes reading them."""

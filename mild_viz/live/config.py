@@ -12,8 +12,9 @@ from mild_viz.settings import WINDOW, Watch
 from mild_viz.toml_config import check_keys, converted, read_toml
 
 RESTS = {"demo": 0.97, "nuisi": 0.2, "handover": 0.07, "yumi": 2.0}
-"""How long the training trials of a dataset go on before this module's thresholds see a start [s], in the median. By
-benchmarks/onset.py, v3 models hardly care; the v4 model of demo errs by 0.027 rad^2 with it and 0.039 with 0.17 s."""
+"""How long the training trials of a dataset go on before this module's thresholds see a start [s], in the median
+(benchmarks/onset.py prints it). v3 models hardly care; the v4 model of demo errs by 0.029 rad^2 with it (there: 29
+frames), and by 0.039 with 0.17 s (5 frames)."""
 
 USUAL_REST = 0.3
 """For any other dataset [s]."""

@@ -25,6 +25,9 @@ Arm = Float[np.ndarray, "3 3"]
 AT_REST = 0.01
 """The arm is back when no joint is farther from its resting place [rad]."""
 
+STOPPED = "the program ends"
+"""Why an interaction ends that nobody but `stop` has ended: a session that is run again knows it by this note."""
+
 REFERENCES = 32
 """Frames over which the person's frame is averaged where it has to be found: half a second to a second."""
 
@@ -134,7 +137,7 @@ class LiveController:
 
     def stop(self) -> None:
         """End the interaction, because the program ends."""
-        self.tracker.end("the program ends")
+        self.tracker.end(STOPPED)
 
     @property
     def at_rest(self) -> bool:

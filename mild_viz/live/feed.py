@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mild_viz.live.controller import Decision
 from mild_viz.live.latency import NONE, SHOWN, Times
 from mild_viz.live.loop import LiveLoop, Tick
+from mild_viz.live.messages import JointCommand
 
 LARGEST = 60_000
 """A snapshot is one message of a few kB; longer ones would not be taken whole everywhere."""
@@ -44,8 +46,6 @@ class Figures:
     troubles: tuple[str, ...] = ()
     recorded: int | None = None
     """Turns in the session's file; None where none is written."""
-    page_dropped: int = 0
-    """Snapshots that the page did not take in time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +89,17 @@ class Feed:
         self._number = 0
         self._figures = Figures()
         self._before: tuple[float, int, int] | None = None
+        self._decision: Decision | None = None
+        """The last one: what the model says is as it was then, where a fault leaves none."""
         self.dropped = 0
+        """Snapshots that the page did not take in time."""
         self.gone = False
         """Whether the page's process is no more."""
 
     def __call__(self, tick: Tick) -> None:
         """Tell the page, if it is time. Neither waits nor raises, whatever became of the page."""
-        if self.gone or tick.decision is None or tick.sent is None or tick.time < self._due:
+        self._decision = tick.decision or self._decision
+        if self.gone or self._decision is None or tick.sent is None or tick.time < self._due:
             return
         self._due = max(self._due + self._period, tick.time)
         if tick.time >= self._status_due:
@@ -103,7 +107,7 @@ class Feed:
             self._figures = self._look(tick.time)
         self._number += 1
         try:
-            self._end.send(pickle.dumps(self._snapshot(tick), protocol=5))
+            self._end.send(pickle.dumps(self._snapshot(tick, self._decision, tick.sent), protocol=5))
         except (BlockingIOError, InterruptedError):
             self.dropped += 1
         except OSError as error:
@@ -116,18 +120,16 @@ class Feed:
         with contextlib.suppress(OSError):
             self._end.close()
 
-    def _snapshot(self, tick: Tick) -> Snapshot:
-        decision, sent, controller = tick.decision, tick.sent, self._loop.controller
-        assert decision is not None and sent is not None
-        command, seen = decision.command, tick.seen
+    def _snapshot(self, tick: Tick, decision: Decision, sent: JointCommand) -> Snapshot:
+        command, seen, controller = decision.command, tick.seen, self._loop.controller
         return Snapshot(
             number=self._number,
             time=tick.time,
-            phase=decision.phase,
+            phase=sent.phase,
             interaction=decision.interaction,
             note=decision.note,
             displacement=controller.tracker.displacement,
-            answers=decision.answers,
+            answers=sent.observed is not None,
             names=() if seen is None else seen.names,
             positions=None if seen is None else controller.body.to_person(seen.positions),
             arm=controller.arm,
@@ -166,7 +168,6 @@ class Feed:
             last_fault=loop.last_fault,
             troubles=tuple(trouble for trouble in troubles if trouble),
             recorded=None if recorder is None else recorder.written,
-            page_dropped=self.dropped,
         )
 
 

@@ -69,6 +69,8 @@ class LiveLoop:
     last_fault: str = ""
     sent: int = 0
     """Commands that left; the last one's sequence number."""
+    last: JointCommand | None = None
+    """The last one."""
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> None:
         """Control until stopped, until the input ends, or for so long [s]; then bring the arm back to rest."""
@@ -137,30 +139,29 @@ class LiveLoop:
 
     def _command(self, seen: Observation | None, decision: Decision | None, now: float) -> JointCommand:
         """The command that leaves: as decided and checked, or the last one again."""
-        last, stiff = self.guard.last, np.ones(len(self.guard.last))
-        phase, contact, fired = self.controller.tracker.phase, False, (FAULT,)
-        positions: Float[np.ndarray, " J"] = last
+        positions: Float[np.ndarray, " J"] = self.guard.last
+        stiffness, contact = np.ones(len(positions)), False
+        phase, fired = self.controller.tracker.phase, (FAULT,)
         if decision is not None:
             command = decision.command
-            positions, stiff = command.joints_commanded, command.stiffness
-            phase, contact, fired = (
-                decision.phase,
-                command.contact,
-                tuple(rule.name for rule in fired_rules(command.fired)),
-            )
-        positions, stiff = self.guard.check(positions, stiff, now)
+            positions, stiffness, contact = command.joints_commanded, command.stiffness, command.contact
+            phase, fired = decision.phase, tuple(rule.name for rule in fired_rules(command.fired))
+        elif self.last is not None:
+            stiffness, contact = self.last.stiffness, self.last.contact
+        positions, stiffness = self.guard.check(positions, stiffness, now)
         self.sent += 1
-        return JointCommand(
+        self.last = JointCommand(
             timestamp=time.time(),
             sequence=self.sent,
             observed=None if seen is None or fired == (FAULT,) else seen.timestamp,
             joint_names=self.controller.model.robot.chain.joint_names,
             positions=positions,
-            stiffness=stiff,
+            stiffness=stiffness,
             phase=phase,
             contact=contact,
             fired=fired,
         )
+        return self.last
 
     def _safely(self, action: Callable[[], None]) -> None:
         try:

@@ -17,7 +17,7 @@ from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
 from mild_viz.latent.hmm import observed_rows, unobserved_forward
 from mild_viz.live.config import LiveConfig
-from mild_viz.live.controller import Decision, LiveController
+from mild_viz.live.controller import STOPPED, Decision, LiveController
 from mild_viz.live.loop import Tick
 from mild_viz.live.onset import INTERACTING, RETURNING
 from mild_viz.live.person import skeleton_bones
@@ -132,19 +132,19 @@ def session_dataset(session: Session) -> Dataset:
     Raises:
         UserError: if it holds none.
     """
-    trials = tuple(session_trial(session, number, index) for index, number in enumerate(interactions(session)))
+    trials = tuple(session_trial(session, ticks, index) for index, ticks in enumerate(interactions(session).values()))
     if not trials:
         raise UserError(f"{session.path} holds no interaction: the hand never left its resting place")
     return Dataset(DATASET, f"Live session {session.path.name}", (), trials, session.header["checkpoint"]["checksum"])
 
 
-def session_trial(session: Session, number: int, index: int) -> Trial:
-    """One interaction as a trial, from what the model was given before its start to the last frame that it took.
+def session_trial(session: Session, ticks: tuple[Tick, ...], index: int) -> Trial:
+    """One of its `interactions` as a trial, from what the model got before its start to the last frame that it took.
 
     Row n of its inference belongs to sample n + 4, the last row to the last sample: five frames that no row reads
     stand at the end, where a recording has the ones that are predicted.
     """
-    samples = np.array([sample for tick in interactions(session)[number] for sample in _decision(tick).samples])
+    samples = np.array([sample for tick in ticks for sample in _decision(tick).samples])
     names = tuple(session.header["robot"]["joint_names"])
     return Trial(
         dataset=DATASET,
@@ -159,9 +159,10 @@ def session_trial(session: Session, number: int, index: int) -> Trial:
     )
 
 
-def recorded_rollout(session: Session, number: int, index: int, checkpoint: Checkpoint, robot: RobotModel) -> Rollout:
-    """One interaction exactly as it was: row n is the n-th command that was sent."""
-    ticks = interactions(session)[number]
+def recorded_rollout(
+    session: Session, ticks: tuple[Tick, ...], index: int, checkpoint: Checkpoint, robot: RobotModel
+) -> Rollout:
+    """One of its `interactions` exactly as it was: row n is the n-th command that was sent."""
     header, settings = session.header, session_settings(session)
     said = [_decision(tick).command for tick in ticks]
     model = checkpoint.members(header["variant"])[0]
@@ -240,10 +241,13 @@ def recorded_rollout(session: Session, number: int, index: int, checkpoint: Chec
 def rerun(session: Session, model: StreamModel, config: LiveConfig) -> Iterator[tuple[Tick, Decision | None]]:
     """Every turn of a session, and what is decided in it with this model and these thresholds.
 
-    With the session's own, the decisions are the recorded ones, to the bit.
+    With the session's own, the decisions are the recorded ones, to the bit: up to the first turn with a `fault`, since
+    nobody knows how much of it was done.
     """
     controller = LiveController(model, config)
     for tick in session.ticks:
+        if tick.decision is not None and tick.decision.note == STOPPED:
+            controller.stop()
         if tick.seen is not None:
             yield tick, controller.observe(tick.seen, tick.time)
         else:

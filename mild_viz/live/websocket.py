@@ -93,7 +93,6 @@ class WebsocketInput(FedInput):
                         self._feed(message.encode() if isinstance(message, str) else message, self.name)
             except Exception as error:  # whatever it is, the next attempt may succeed
                 self.trouble = f"{self.name}: {getattr(error, 'strerror', None) or error or 'no answer'}"
-                self.counts.last_error = self.trouble
             await asyncio.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE)
 

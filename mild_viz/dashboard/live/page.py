@@ -59,6 +59,7 @@ class LivePage:
         self._last: Snapshot | None = None
         self._heard = time.monotonic()
         self._behind = 0
+        """Snapshots that never came here, or were left out for a newer one: their numbers are missing."""
         asyncio.run_coroutine_threadsafe(self._fit_cameras(), self.server.get_event_loop())
 
     def show(self, now: Snapshot | None) -> None:
@@ -84,7 +85,7 @@ class LivePage:
         if now is not None and self.server.get_clients():
             set_content(self._now, status.now_html(now, self._config))
             set_content(self._chart, self._rolling.html())
-            set_content(self._figures, status.figures_html(figures, 0))
+            set_content(self._figures, status.figures_html(figures, self._behind))
 
     async def _fit_cameras(self) -> None:
         while True:

@@ -24,6 +24,10 @@ from mild_viz.robot.model import RobotModel
 from mild_viz.settings import ControlSettings
 from mild_viz.trial import Skeleton
 
+MOVED = ("limb_positions", "limb_wxyzs", "limb_scales", "ball_positions", "ball_scales", "torso_poses",
+         "head_positions")  # fmt: skip
+"""What of a figure is written anew for every snapshot."""
+
 
 class LiveScene(Scene):
     """Draws snapshots. `follow` may be called from one thread, the cameras from another."""
@@ -60,8 +64,7 @@ class LiveScene(Scene):
         self._think(now)
         with self._lock, self._server.atomic():
             if figure is not None:
-                for name in ("limb_positions", "limb_wxyzs", "limb_scales", "ball_positions", "ball_scales",
-                             "torso_poses", "head_positions"):  # fmt: skip
+                for name in MOVED:
                     getattr(self._live_figure, name)[0] = getattr(figure, name)[0]
             self._live_tracked[0] = bool(np.isfinite(now.arm).all())
             frames = self._live_robot
@@ -122,6 +125,8 @@ class LiveScene(Scene):
         if skeleton is None:
             return arm_figure(now.arm[None], height)
         figure = skeleton_figure(skeleton, height)
+        if seen.all():
+            return figure
         whole = self._skeleton(self._seen)
         assert whole is not None
         last = skeleton_figure(whole, height)
@@ -155,9 +160,7 @@ class LiveScene(Scene):
 
 def first_row(figure: Figure) -> Figure:
     """The figure's first frame alone, in arrays that can be written."""
-    names = ("limb_positions", "limb_wxyzs", "limb_scales", "ball_positions", "ball_scales", "torso_poses",
-             "head_positions")  # fmt: skip
-    return replace(figure, **{name: np.array(getattr(figure, name)[:1]) for name in names})
+    return replace(figure, **{name: np.array(getattr(figure, name)[:1]) for name in MOVED})
 
 
 def empty_plot(frames: LatentFrames) -> LatentFrames:

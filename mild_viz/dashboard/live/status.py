@@ -125,7 +125,7 @@ def figures_html(figures: Figures, page_behind: int) -> str:
         ("made without a frame", done.get("held", 0)),
         ("cut by the last check", figures.refused),
         ("Clock jumps, faults", f"{figures.clock_jumps}, {figures.faults}"),
-        ("Frames this page left out", figures.page_dropped + page_behind),
+        ("Frames this page left out", page_behind),
     ]
     if figures.recorded is not None:
         counts.append(("Turns recorded", figures.recorded))
@@ -139,8 +139,8 @@ def trouble_html(figures: Figures, silent: float) -> str:
         lines.insert(0, f"No word from the control process for {silent:.0f} s: what is shown is old")
     for label, text in (
         ("Last fault", figures.last_fault),
-        ("Last rejected frame", (figures.input_counts or {}).get("last_error", "")),
-        ("Last command that failed", (figures.output_counts or {}).get("last_error", "")),
+        ("Last error of the input", (figures.input_counts or {}).get("last_error", "")),
+        ("Last error of the output", (figures.output_counts or {}).get("last_error", "")),
     ):
         if text:
             lines.append(f"{label}: {text}")

@@ -37,7 +37,7 @@ class StatesTab:
         self._boxes: list[viser.GuiCheckboxHandle] = []
         self._of: tuple[object, ...] = ()
         self._unsaved: dict[tuple[object, ...], frozenset[int]] = {}
-        """Ticks of what was shown before, for when a person comes back to it."""
+        """Ticks for what is not shown now, until it is."""
         self.save = gui.add_button(
             "Save contact states", icon=viser.Icon.DEVICE_FLOPPY,
             hint=SAVE_NOTE,
@@ -57,8 +57,12 @@ class StatesTab:
         for state, box in enumerate(self._boxes):
             box.visible = state < n_states
 
+    def remember(self, checkpoint: Checkpoint, variant: str, action: str, states: frozenset[int]) -> None:
+        """Tick these once this model and action are shown."""
+        self._unsaved[checkpoint.members(variant)[0].human_vae, action] = states
+
     def read(self, checkpoint: Checkpoint, variant: str, action: str) -> frozenset[int]:
-        """The ticked states. Another model or action brings what was last ticked for it, at first its own default."""
+        """The ticked states. Another model or action brings what is remembered for it, else its own default."""
         human = checkpoint.members(variant)[0].human_vae
         if len(self._boxes) < checkpoint.n_states or self._of[:1] != (human,):
             self._build(checkpoint.n_states)
