@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mild_viz.checkpoint import load_checkpoint
 from mild_viz.data.load import load_dataset
-from mild_viz.evaluation.controllers import controller_figures, run_controllers
+from mild_viz.evaluation.controllers import controller_figures
 from mild_viz.paths import default_checkpoint
-from mild_viz.pipeline import infer
+from mild_viz.pipeline import control, infer
 from mild_viz.robot.ik import forward
 from mild_viz.robot.model import load_robot
 from mild_viz.settings import CONTROLLERS_OF, ControlSettings
@@ -19,7 +21,10 @@ def test_figures_are_what_they_are_defined_as() -> None:
     checkpoint, robot = load_checkpoint(default_checkpoint("demo")), load_robot("pepper")
     trial = next(trial for trial in load_dataset("demo").test if trial.action == "handshake")
     inference, settings = infer(checkpoint, trial, "v3.1"), ControlSettings(lambda_x=2.0, lambda_q=0.05)
-    rollouts = run_controllers(inference, checkpoint, robot, trial, settings, CONTROLLERS_OF["joints"])
+    rollouts = [
+        control(inference, checkpoint, robot, trial, replace(settings, controller=name))
+        for name in CONTROLLERS_OF["joints"]
+    ]
     figures = [controller_figures(rollout, robot.chain, 2.0, 0.05) for rollout in rollouts]
     assert tuple(one.controller for one in figures) == CONTROLLERS_OF["joints"]
     for rollout, one in zip(rollouts, figures, strict=True):
@@ -52,7 +57,7 @@ def test_without_contact_the_figures_of_contact_are_unknown() -> None:
     trial = next(trial for trial in load_dataset("demo").test if trial.action == "wave")
     inference = infer(checkpoint, trial, "v3.1")
     settings = ControlSettings(contact_states=frozenset())
-    (rollout,) = run_controllers(inference, checkpoint, robot, trial, settings, ["mild"])
+    rollout = control(inference, checkpoint, robot, trial, replace(settings, controller="mild"))
     figures = controller_figures(rollout, robot.chain, 1.0, 0.01)
     assert figures.n_contact == 0 and np.isnan([figures.mean_distance, figures.ik_cost]).all()
     assert figures.limit_margin >= 0.0

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import threading
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -25,7 +26,7 @@ from mild_viz.dashboard.timeline import Timeline
 from mild_viz.data.load import load_dataset
 from mild_viz.decoding import open_robot
 from mild_viz.errors import UserError
-from mild_viz.evaluation.controllers import controller_figures, run_controllers
+from mild_viz.evaluation.controllers import controller_figures
 from mild_viz.robot.model import RobotModel
 from mild_viz.robot.source import RobotSource
 from mild_viz.rollout import Rollout
@@ -101,9 +102,10 @@ class Dashboard:
         if of is not rollout:
             ran = {rollout.controller: rollout}
         missing = [name for name in choice.view.compared if name not in ran]
-        settings = choice.settings.control
-        more = run_controllers(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings, missing)
-        ran |= {one.controller: one for one in more}
+        for name in missing:
+            # where the human is shown, which no widget may say
+            settings = replace(choice.settings.control, controller=name, placement=rollout.placement)
+            ran[name] = pipeline.control(rollout.inference, choice.checkpoint, choice.robot, choice.trial, settings)
         self._compared = rollout, ran
         return tuple(ran[name] for name in choice.view.compared)
 

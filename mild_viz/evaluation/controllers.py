@@ -1,20 +1,14 @@
-"""Several controllers on one trial: what each makes of the same inference, and how they compare."""
+"""What a controller makes of a trial, in figures by which several can be compared."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
 
-from mild_viz.checkpoint import Checkpoint
-from mild_viz.pipeline import control
 from mild_viz.robot.chain import ArmChain
-from mild_viz.robot.model import RobotModel
-from mild_viz.rollout import Inference, Rollout
-from mild_viz.settings import ControlSettings
-from mild_viz.trial import Trial
+from mild_viz.rollout import Rollout
 
 
 @dataclass(frozen=True)
@@ -31,21 +25,6 @@ class ControllerFigures:
     """Eq. ik-prior-simplified, mean over the frames in contact: lambda_x |x - f(q)|^2 + lambda_q |mu_q - q|^2."""
     limit_margin: float
     """Smallest distance of any joint from its limits over the whole trial [rad]."""
-
-
-def run_controllers(
-    inference: Inference,
-    checkpoint: Checkpoint,
-    robot: RobotModel,
-    trial: Trial,
-    settings: ControlSettings,
-    controllers: Sequence[str],
-) -> tuple[Rollout, ...]:
-    """One rollout per controller, all else as in `settings`."""
-    return tuple(
-        control(inference, checkpoint, robot, trial, replace(settings, controller=controller))
-        for controller in controllers
-    )
 
 
 def controller_figures(rollout: Rollout, chain: ArmChain, lambda_x: float, lambda_q: float) -> ControllerFigures:

@@ -74,8 +74,8 @@ class RecordedSession:
             recorded = self._rollout(trial.index)
             if settings == self._as_recorded:
                 return recorded
-            # What no widget stands for, or not before it is moved.
-            settings = replace(settings, watch=self.settings.watch, placement=settings.placement or recorded.placement)
+            # No widget stands for the placement before it is moved.
+            settings = replace(settings, placement=settings.placement or recorded.placement)
             if inference is recorded.inference:  # it has a row for every command, a rerun one for every frame
                 inference = pipeline.infer(checkpoint, trial, inference.variant, robot)
         return pipeline.control(inference, checkpoint, robot, trial, settings)

@@ -26,6 +26,8 @@ class RobotTab:
     """Widgets of `ControlSettings`, but for the contact states."""
 
     def __init__(self, gui: viser.GuiApi, changed: Changed, default: ControlSettings) -> None:
+        self._watch = default.watch
+        """No widget stands for it: as the page was opened with."""
         self._controller = gui.add_dropdown(
             "Controller", CONTROLLERS_OF["joints"], initial_value=default.controller,
             hint="base-ik: to the hand. mild: as decoded. mild-ik: adapted in contact. task-space: both decoded hands.",
@@ -108,6 +110,7 @@ class RobotTab:
             stiffness=bool(self._stiffness.value),
             smoothing=number(self._smoothing),
             placement=self._placement(checkpoint, trial),
+            watch=self._watch,
         )
 
     def _placement(self, checkpoint: Checkpoint, trial: Trial) -> Placement | None:
