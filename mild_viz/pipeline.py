@@ -7,6 +7,7 @@ Both are pure functions: a page, a command or a test calls them alike.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from mild_viz.checkpoint import Checkpoint
 from mild_viz.data.windows import fill_gaps, human_windows, max_gap, windows
 from mild_viz.decoding import decoding_of, hand_map_of, open_robot, points_of
 from mild_viz.errors import UserError
-from mild_viz.latent.hmm import forward_filter, log_emission, observed_rows, unobserved_forward
+from mild_viz.latent.hmm import HMM, forward_filter, log_emission, observed_rows, unobserved_forward
 from mild_viz.latent.interaction import InteractionModel
 from mild_viz.latent.transition import TransitionState
 from mild_viz.pairs import check_points, check_rate, window_errors
@@ -55,7 +56,6 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
 
     model = checkpoint.members(variant)[0]
     hmm, size = model.hmms[trial.action], model.human_vae.latent_size
-    human, partner = slice(0, size), slice(size, 2 * size)
     moved, truth = decoding.move(said.decoded, decoding.start()), decoding.truth(trial)
     truth_windows = windows(truth.features)[WINDOW:]
     latent_truth, _ = model.robot_vae.encode(truth_windows)
@@ -86,10 +86,7 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         joints_decoded=moved.joints,
         joints_truth=truth.joints[first],
         window_error=window_errors(said.decoded, truth_windows, moved.partner is not None),
-        human_state_means=hmm.emission_means[:, human],
-        human_state_covariances=hmm.emission_covariances[:, human, human],
-        robot_state_means=hmm.emission_means[:, partner],
-        robot_state_covariances=hmm.emission_covariances[:, partner, partner],
+        **state_gaussians(hmm, size),
         human_arm=trial.human_arm[newest],
         human_hand=points[newest, checkpoint.points.index(WRIST)],
         human_skeleton=None if trial.human_skeleton is None else trial.human_skeleton.rows(newest),
@@ -102,6 +99,17 @@ def infer(checkpoint: Checkpoint, trial: Trial, variant: str, robot: RobotModel 
         partner_truth=None if moved.partner is None else points_of(truth.features[first], len(checkpoint.points)),
         others_decoded=moved.others,
     )
+
+
+def state_gaussians(hmm: HMM, size: int) -> dict[str, Any]:
+    """Each agent's part of the states, of which the human has the first `size` dimensions: fields of `Inference`."""
+    human, robot = slice(0, size), slice(size, 2 * size)
+    return {
+        "human_state_means": hmm.emission_means[:, human],
+        "human_state_covariances": hmm.emission_covariances[:, human, human],
+        "robot_state_means": hmm.emission_means[:, robot],
+        "robot_state_covariances": hmm.emission_covariances[:, robot, robot],
+    }
 
 
 def joint_log_alpha(

@@ -22,7 +22,7 @@ from mild_viz.live.loop import Tick
 from mild_viz.live.onset import INTERACTING, RETURNING
 from mild_viz.live.person import skeleton_bones
 from mild_viz.live.session import Session
-from mild_viz.pipeline import joint_log_alpha, state_visits
+from mild_viz.pipeline import joint_log_alpha, state_gaussians, state_visits
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import WINDOW, ControlSettings, Placement, Watch
@@ -167,7 +167,6 @@ def recorded_rollout(
     said = [_decision(tick).command for tick in ticks]
     model = checkpoint.members(header["variant"])[0]
     hmm, size = model.hmms[header["action"]], model.human_vae.latent_size
-    human, partner = slice(0, size), slice(size, 2 * size)
     T_world_human = np.array(header["T_world_human"], dtype=np.float64)
 
     commanded = np.array([tick.sent.positions for tick in ticks if tick.sent is not None])
@@ -201,10 +200,7 @@ def recorded_rollout(
         joints_decoded=decoded,
         joints_truth=unknown,
         window_error=np.full(n_rows, np.nan),
-        human_state_means=hmm.emission_means[:, human],
-        human_state_covariances=hmm.emission_covariances[:, human, human],
-        robot_state_means=hmm.emission_means[:, partner],
-        robot_state_covariances=hmm.emission_covariances[:, partner, partner],
+        **state_gaussians(hmm, size),
         human_arm=arms,
         human_hand=to_frame(T_world_human, target),
         human_skeleton=_skeleton(ticks),

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mild_viz.checkpoint import Checkpoint
+from mild_viz.pipeline import state_gaussians
 from mild_viz.robot.model import RobotModel
 from mild_viz.rollout import Inference, Rollout
 from mild_viz.settings import ControlSettings, Placement
@@ -29,9 +30,9 @@ def resting_rollout(
     the plot's axes hold whatever will come."""
     model = checkpoint.members(variant)[0]
     hmm, size = model.hmms[action], model.human_vae.latent_size
-    human, partner = slice(0, size), slice(size, 2 * size)
+    states = state_gaussians(hmm, size)
     around = [
-        sigma_points(hmm.emission_means[:, part], hmm.emission_covariances[:, part, part]) for part in (human, partner)
+        sigma_points(states[f"{who}_state_means"], states[f"{who}_state_covariances"]) for who in ("human", "robot")
     ]
     n_rows, n_joints = len(around[0]), robot.chain.n_joints
     joints = np.tile(robot.chain.rest, (n_rows, 1))
@@ -65,10 +66,7 @@ def resting_rollout(
         joints_decoded=joints,
         joints_truth=unknown,
         window_error=np.full(n_rows, np.nan),
-        human_state_means=hmm.emission_means[:, human],
-        human_state_covariances=hmm.emission_covariances[:, human, human],
-        robot_state_means=hmm.emission_means[:, partner],
-        robot_state_covariances=hmm.emission_covariances[:, partner, partner],
+        **states,
         human_arm=arms,
         human_hand=arms[:, 2],
         human_skeleton=skeleton,
