@@ -206,6 +206,7 @@ def test_a_trunk_that_is_lost_stays_where_it_was(
         return skeleton_figure(*arguments)
 
     page.scene.follow(replace(snapshot, names=names, positions=body[0]))  # lays the scene out
+    assert not page.scene._server.scene._handle_from_node_name["/reach"].visible, "it would mark where no hand is"
     monkeypatch.setattr("mild_viz.dashboard.live.scene.skeleton_figure", counted)
     page.scene.follow(replace(snapshot, names=names, positions=body[0]))
     assert next(drawn) == 1, "of a body that is seen whole, one figure does"

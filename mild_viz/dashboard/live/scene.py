@@ -94,6 +94,7 @@ class LiveScene(Scene):
         )
         self._live_latent = empty_plot(self._latent_frames)
         with self._lock, self._server.atomic():
+            self._reach.show(rollout, colors, False)  # it marks the resting hand, not the one that comes
             self._human.show(self._live_figure, self._T_world_human, layout.floor, colors, True, self._live_tracked)
             self._robot.show(self._live_robot, layout.robot_title, self._settings.controller, colors, True, True)
             self._latent.show(self._live_latent, layout, colors, True)
