@@ -74,12 +74,11 @@ def test_a_frame_arrives_as_it_was_sent(source: Input, send: Sender) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux says when a datagram arrived")
 def test_what_waited_counts_from_its_arrival(source: Input, send: Sender) -> None:
     """So that the time which the control thread was busy is in the latency."""
-    before = time.perf_counter()
     send(frame(1))
-    after = time.perf_counter()
-    time.sleep(0.1)
+    time.sleep(0.3)
+    read = time.perf_counter()
     seen = source.poll(0.0)
-    assert seen is not None and before - 0.005 <= seen.received <= after + 0.005
+    assert seen is not None and seen.received < read - 0.15  # half of it: two clocks are read, one after the other
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux says when a datagram arrived")
